@@ -1,0 +1,26 @@
+from setuptools import setup
+
+package = "crash_coach_pkg"
+
+setup(
+    name=package,
+    version="0.1.0",
+    description="The coach decides who crashes, when and how; the gate carries it out on command topics.",
+    maintainer="Crash Coach engineers",
+    maintainer_email="team@crash-coach.dev",
+    license="Apache-2.0",
+    packages=["crash_coach_pkg", "crash_coach_pkg.ros"],
+    package_data={},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
+        (f"share/{package}", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=False,
+    entry_points={
+        "console_scripts": [
+            "coach = crash_coach_pkg.ros.coach_node:main",
+            "gate = crash_coach_pkg.ros.gate_node:main",
+        ],
+    },
+)

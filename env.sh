@@ -1,0 +1,21 @@
+# Source me (bash): puts the virtual environment and the built workspace on this shell.
+#     . ./env.sh
+# Where a Jazzy distribution is sourced it stays the underlay; otherwise the wheels are.
+_cc_root="$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)"
+if [ ! -f "$_cc_root/.venv/bin/activate" ] || [ ! -f "$_cc_root/ros_ws/install/local_setup.bash" ]; then
+    echo "Crash Coach is not set up yet: run 'make setup' in $_cc_root" >&2
+    unset _cc_root
+    return 1
+fi
+. "$_cc_root/.venv/bin/activate"
+if [ "${ROS_DISTRO:-}" != jazzy ]; then
+    case ":${AMENT_PREFIX_PATH:-}:" in
+        *":$VIRTUAL_ENV:"*) ;;
+        *) export AMENT_PREFIX_PATH="$VIRTUAL_ENV${AMENT_PREFIX_PATH:+:$AMENT_PREFIX_PATH}" ;;
+    esac
+fi
+. "$_cc_root/ros_ws/install/local_setup.bash"
+# One thread per process: a second run is a better use of a second core.
+export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE
+export ROS_AUTOMATIC_DISCOVERY_RANGE="${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}"
+unset _cc_root

@@ -1,0 +1,1 @@
+"""Decentralised QMIX agents: acting (numpy), training (torch, under train/), and ROS 2 nodes."""

@@ -1,0 +1,26 @@
+from setuptools import setup
+
+package = "policy_pkg"
+
+setup(
+    name=package,
+    version="0.1.0",
+    description="Decentralised QMIX agents: policy nodes and the trainer.",
+    maintainer="Crash Coach engineers",
+    maintainer_email="team@crash-coach.dev",
+    license="Apache-2.0",
+    packages=["policy_pkg", "policy_pkg.ros", "policy_pkg.train"],
+    package_data={"policy_pkg": ["configs/**/*.yaml"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
+        (f"share/{package}", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=False,
+    entry_points={
+        "console_scripts": [
+            "policy = policy_pkg.ros.policy_node:main",
+            "team = policy_pkg.ros.team_node:main",
+        ],
+    },
+)

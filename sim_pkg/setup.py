@@ -1,0 +1,25 @@
+from setuptools import setup
+
+package = "sim_pkg"
+
+setup(
+    name=package,
+    version="0.1.0",
+    description="Multi-robot simulator on pymunk, as a library, a PettingZoo environment and a ROS 2 node.",
+    maintainer="Crash Coach engineers",
+    maintainer_email="team@crash-coach.dev",
+    license="Apache-2.0",
+    packages=["sim_pkg", "sim_pkg.ros", "sim_pkg.scenarios"],
+    package_data={"sim_pkg": ["configs/**/*.yaml"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
+        (f"share/{package}", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=False,
+    entry_points={
+        "console_scripts": [
+            "sim = sim_pkg.ros.sim_node:main",
+        ],
+    },
+)
