@@ -1,0 +1,41 @@
+# Every target sets the checkout up first; a second set-up takes under 3 s.
+SHELL := /bin/bash
+PYTHON ?=
+IN_ENV := . ./env.sh &&
+CODE := sim_pkg policy_pkg crash_coach_pkg ros_ws/src/crash_coach_bringup tests benchmarks scripts
+
+.PHONY: help setup check test demo bench soak format lock clean
+
+help: ## this list
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
+
+setup: ## .venv, pinned packages, built ROS workspace
+	@PYTHON="$(PYTHON)" $(if $(PYTHON),$(PYTHON),python3) scripts/setup.py
+
+check: setup ## ruff, mypy, the architecture's laws, the documents' commands
+	$(IN_ENV) ruff format --check $(CODE) && ruff check $(CODE)
+	$(IN_ENV) mypy sim_pkg/sim_pkg policy_pkg/policy_pkg crash_coach_pkg/crash_coach_pkg \
+	    ros_ws/src/crash_coach_bringup/crash_coach_bringup scripts benchmarks
+	$(IN_ENV) pytest tests/test_architecture.py tests/test_documents.py
+
+test: setup ## the test suite, under 5 minutes on 2 cores
+	$(IN_ENV) pytest -m "not soak"
+
+demo: setup ## train two teams, run them as ROS graphs, crash robots, read off the cost
+	$(IN_ENV) crash-coach demo
+
+bench: setup ## every benchmark, to runs/bench.json
+	$(IN_ENV) python -m benchmarks
+
+soak: setup ## fuzz, kill and latency tests at full size
+	$(IN_ENV) pytest -m soak --timeout 3600
+
+format: setup ## put the code in its format
+	$(IN_ENV) ruff format $(CODE) && ruff check --fix $(CODE)
+
+lock: setup ## requirements.in -> requirements.lock
+	.venv/bin/uv pip compile --quiet --universal --no-header --python-version 3.11 \
+	    requirements.in -o requirements.lock
+
+clean: ## remove what set-up and builds left (runs/ stays)
+	rm -rf .venv ros_ws/build ros_ws/install ros_ws/log

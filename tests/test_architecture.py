@@ -1,0 +1,164 @@
+"""The import law, the links, the limits on size: what docs/architecture.md promises."""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+BRINGUP = ROOT / "ros_ws/src/crash_coach_bringup/crash_coach_bringup"
+PACKAGES = {
+    "sim_pkg": ROOT / "sim_pkg/sim_pkg",
+    "policy_pkg": ROOT / "policy_pkg/policy_pkg",
+    "crash_coach_pkg": ROOT / "crash_coach_pkg/crash_coach_pkg",
+    "crash_coach_bringup": BRINGUP,
+}
+MESSAGES = {
+    "rclpy", "crash_coach_interfaces", "std_msgs", "geometry_msgs", "nav_msgs", "std_srvs",
+    "visualization_msgs", "diagnostic_msgs", "rosgraph_msgs", "rcl_interfaces",
+    "builtin_interfaces", "ament_index_python",
+}  # fmt: skip
+MAX_FILE_LINES = 300
+MAX_FUNCTION_LINES = 50
+
+
+def modules() -> Iterator[tuple[str, Path]]:
+    for package, folder in PACKAGES.items():
+        for path in sorted(folder.rglob("*.py")):
+            yield package, path
+
+
+def imports(path: Path) -> Iterator[tuple[str, int]]:
+    """Every imported module, also inside functions, with its line."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield alias.name, node.lineno
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}:{node.lineno}: relative import"
+            yield str(node.module), node.lineno
+            for alias in node.names:
+                yield f"{node.module}.{alias.name}", node.lineno
+
+
+def within(name: str, module: str) -> bool:
+    return name == module or name.startswith(module + ".")
+
+
+def allowed(package: str, path: Path, name: str) -> bool:
+    """Whether the import law lets ``path`` import ``name``."""
+    inside = path.relative_to(PACKAGES[package]).parts
+    top = name.split(".")[0]
+    if top in MESSAGES:
+        return "ros" in inside[:-1]
+    if top == "pymunk":
+        return path == PACKAGES["sim_pkg"] / "world.py"
+    if top == "torch":
+        return package == "policy_pkg" and inside[0] == "train"
+    if top == "yaml":
+        return path.name == "config.py"
+    if top not in PACKAGES or top == package or package == "crash_coach_bringup":
+        return True
+    if package == "policy_pkg" and inside[0] == "train" and top != "crash_coach_bringup":
+        return not within(name, f"{top}.ros")
+    # `from sim_pkg import contract` reads as "sim_pkg" and "sim_pkg.contract".
+    return package != "sim_pkg" and top == "sim_pkg" and within(name, "sim_pkg.contract")
+
+
+def test_import_law() -> None:
+    broken = [
+        f"{path.relative_to(ROOT)}:{line} imports {name}"
+        for package, path in modules()
+        for name, line in imports(path)
+        if not allowed(package, path, name)
+    ]
+    assert not broken, "\n".join(broken)
+
+
+@pytest.mark.parametrize(
+    ("package", "inside", "name", "expected"),
+    [
+        ("sim_pkg", "env.py", "policy_pkg.act", False),
+        ("sim_pkg", "env.py", "pymunk", False),
+        ("sim_pkg", "world.py", "pymunk", True),
+        ("sim_pkg", "env.py", "rclpy", False),
+        ("sim_pkg", "ros/sim_node.py", "rclpy.node", True),
+        ("crash_coach_pkg", "gate.py", "sim_pkg.contract", True),
+        ("crash_coach_pkg", "gate.py", "sim_pkg.env", False),
+        ("policy_pkg", "policy.py", "torch", False),
+        ("policy_pkg", "train/learner.py", "torch.nn", True),
+        ("policy_pkg", "train/rollout.py", "crash_coach_pkg.coach", True),
+        ("policy_pkg", "train/rollout.py", "crash_coach_pkg.ros.gate_node", False),
+        ("policy_pkg", "ros/policy_node.py", "crash_coach_pkg.gate", False),
+        ("policy_pkg", "policy.py", "yaml", False),
+    ],
+)
+def test_the_law_itself(package: str, inside: str, name: str, expected: bool) -> None:
+    assert allowed(package, PACKAGES[package] / inside, name) is expected
+
+
+def test_acting_and_evaluating_do_not_load_torch() -> None:
+    code = (
+        "import sys, policy_pkg.policy, policy_pkg.checkpoint, policy_pkg.train.evaluate, "
+        "policy_pkg.train.rollout, policy_pkg.train.config; sys.exit('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+
+
+def test_files_and_functions_stay_small() -> None:
+    folders = [*PACKAGES.values(), ROOT / "tests", ROOT / "benchmarks", ROOT / "scripts"]
+    long = []
+    for path in (p for folder in folders for p in sorted(folder.rglob("*.py"))):
+        text = path.read_text()
+        lines = text.count("\n")
+        if lines > MAX_FILE_LINES:
+            long.append(f"{path.relative_to(ROOT)}: {lines} lines")
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                length = (node.end_lineno or node.lineno) - node.lineno + 1
+                if length > MAX_FUNCTION_LINES:
+                    long.append(
+                        f"{path.relative_to(ROOT)}:{node.lineno} {node.name}: {length} lines"
+                    )
+    assert not long, "\n".join(long)
+
+
+def test_links_are_relative_and_lead_somewhere() -> None:
+    listed = subprocess.run(
+        ["git", "ls-files", "-s"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    links = [
+        line.split("\t")[1] for line in listed.stdout.splitlines() if line.startswith("120000")
+    ]
+    assert {"ros_ws/src/sim_pkg", "ros_ws/src/policy_pkg", "ros_ws/src/crash_coach_pkg"} <= set(
+        links
+    )
+    for link in links:
+        target = os.readlink(ROOT / link)
+        assert not target.startswith("/"), f"{link} -> {target}"
+        assert (ROOT / link).exists(), f"{link} -> {target}"
+
+
+def test_no_path_of_one_machine_is_committed() -> None:
+    found = subprocess.run(
+        [
+            "git",
+            "grep",
+            "-nIE",
+            r"/(root|home/[a-z]+|work)/",
+            "--",
+            ":!requirements.lock",
+            ":!LICENSE",
+        ],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    hits = [line for line in found.stdout.splitlines() if "test_architecture.py" not in line]
+    assert not hits, "\n".join(hits)
