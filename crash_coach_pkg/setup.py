@@ -5,7 +5,7 @@ package = "crash_coach_pkg"
 setup(
     name=package,
     version="0.1.0",
-    description="The coach decides who crashes, when and how; the gate carries it out on command topics.",
+    description="The coach decides who crashes, when and how; the gate carries it out.",
     maintainer="Crash Coach engineers",
     maintainer_email="team@crash-coach.dev",
     license="Apache-2.0",

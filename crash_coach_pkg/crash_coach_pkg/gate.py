@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from sim_pkg.contract import BoolArray, EpisodeArray, IntArray
 
 from crash_coach_pkg.plan import Mode
+from sim_pkg.contract import BoolArray, EpisodeArray, IntArray
 
 UInt64Array = npt.NDArray[np.uint64]
 
@@ -27,7 +27,9 @@ def _splitmix64(x: UInt64Array) -> UInt64Array:
     return x ^ (x >> np.uint64(31))
 
 
-def random_bits(seed: int, episode: EpisodeArray, step: EpisodeArray, robot: IntArray) -> UInt64Array:
+def random_bits(
+    seed: int, episode: EpisodeArray, step: EpisodeArray, robot: IntArray
+) -> UInt64Array:
     """64 uniform bits for each (episode, step, robot); the arrays broadcast together."""
     key = _splitmix64(np.atleast_1d(np.uint64(seed)))
     for counter in (episode, step, robot):
@@ -40,7 +42,8 @@ def random_available(bits: UInt64Array, available: BoolArray) -> IntArray:
     counts = available.sum(axis=-1).astype(np.uint64)
     pick = ((bits >> np.uint64(32)) * counts) >> np.uint64(32)
     order = np.cumsum(available, axis=-1)
-    return np.argmax(order > pick[..., None].astype(np.int64), axis=-1).astype(np.int32)
+    chosen: IntArray = np.argmax(order > pick[..., None].astype(np.int64), axis=-1).astype(np.int32)
+    return chosen
 
 
 def apply_faults(

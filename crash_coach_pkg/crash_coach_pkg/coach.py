@@ -1,0 +1,159 @@
+"""The coach: keeps the crash rate, plans each episode's crashes, records evaluation blocks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from crash_coach_pkg.config import CoachConfig, check_team
+from crash_coach_pkg.plan import CrashPlan, Fault, parse_mode
+from crash_coach_pkg.sampling import crash_cap, draw_exactly, draw_mask, episode_rng
+from crash_coach_pkg.strategies import Progress, make_strategy
+from sim_pkg.contract import BoolArray
+
+JsonScalar = int | float
+Decision = Literal["raise", "lower", "keep"]
+
+
+@dataclass(frozen=True)
+class BlockRecord:
+    """One evaluation block. The crash fraction counts training robots-episodes since the last."""
+
+    rate: float  # alpha_t, in force up to this block
+    cap: int
+    crashed_fraction: float | None  # realised; None: no episode was counted
+    episodes: int  # counted for crashed_fraction
+    success_rate: float  # e_t
+    decision: Decision
+    new_rate: float  # alpha_{t+1}
+
+
+class Coach:
+    """Plans crashes for a team.
+
+    Args:
+        config: the settings.
+        robots: names of the team, in robot order.
+        seed: keys every draw together with the episode, and the random actions of the plans.
+
+    Raises:
+        ValueError: settings that this team cannot keep, or a negative seed.
+    """
+
+    def __init__(self, config: CoachConfig, robots: tuple[str, ...], seed: int) -> None:
+        check_team(config, robots)
+        if not 0 <= seed < 2**63:
+            raise ValueError(f"seed {seed} is not in 0..2^63-1")
+        self._config = config
+        self._robots = robots
+        self._seed = seed
+        self._strategy = make_strategy(config)
+        self._mode = parse_mode(config.crash_mode)
+        self._rate = self._strategy.initial_rate
+        self._revision = 0
+        self._episodes = 0
+        self._crashed = 0
+
+    @property
+    def config(self) -> CoachConfig:
+        return self._config
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        return self._robots
+
+    @property
+    def rate(self) -> float:
+        """The nominal crash rate alpha in force."""
+        return self._rate
+
+    @property
+    def needs_success(self) -> bool:
+        """Whether the strategy reads success rates: refuse environments that report none."""
+        return self._strategy.needs_success
+
+    @property
+    def cap(self) -> int:
+        """Most robots that may crash together at the present rate."""
+        c, n = self._config, len(self._robots)
+        return crash_cap(c.cap_rule, n, self._rate, c.max_crashed, c.min_alive, c.resample)
+
+    def plan(self, episode: int) -> CrashPlan:
+        """The crashes of ``episode``: the same for the same (config, rate, seed, episode)."""
+        mask, cap = self._mask(episode)
+        faults = tuple(
+            Fault(int(robot), self._mode, self._config.start_step, self._config.duration_steps)
+            for robot in np.flatnonzero(mask)
+        )
+        return CrashPlan(episode, self._revision, self._seed, self._rate, cap, faults)
+
+    def _mask(self, episode: int) -> tuple[BoolArray, int]:
+        config, n = self._config, len(self._robots)
+        if config.strategy == "none":
+            return np.zeros(n, dtype=np.bool_), 0
+        if config.victims:
+            return np.array([name in config.victims for name in self._robots]), len(config.victims)
+        rng = episode_rng(self._seed, episode)
+        if config.crashed_exactly >= 0:
+            return draw_exactly(rng, n, config.crashed_exactly), config.crashed_exactly
+        return draw_mask(rng, n, self._rate, self.cap), self.cap
+
+    def count(self, plan: CrashPlan) -> None:
+        """Counts a training episode towards the realised crash fraction of the block."""
+        self._episodes += 1
+        self._crashed += len({fault.robot for fault in plan.faults})
+
+    def advance(self, progress: Progress) -> None:
+        """Lets strategies that follow training progress move the rate."""
+        self._set_rate(self._strategy.next_rate(self._rate, None, progress))
+
+    def record_block(self, success_rate: float, progress: Progress) -> BlockRecord:
+        """Ends an evaluation block with its success rate e_t and moves the rate.
+
+        Raises:
+            ValueError: a success rate outside [0, 1].
+        """
+        if not 0 <= success_rate <= 1:
+            raise ValueError(f"success rate {success_rate} is not in [0, 1]")
+        old, cap, episodes = self._rate, self.cap, self._episodes
+        fraction = self._crashed / (episodes * len(self._robots)) if episodes else None
+        self._set_rate(self._strategy.next_rate(old, success_rate, progress))
+        self._episodes = self._crashed = 0
+        decision: Decision = (
+            "raise" if self._rate > old else "lower" if self._rate < old else "keep"
+        )
+        return BlockRecord(old, cap, fraction, episodes, success_rate, decision, self._rate)
+
+    def _set_rate(self, rate: float) -> None:
+        if not 0 <= rate <= 1:
+            raise ValueError(
+                f"strategy {self._config.strategy!r} returned crash rate {rate}, not in [0, 1]"
+            )
+        if rate != self._rate:
+            self._rate = rate
+            self._revision += 1
+
+    def state_dict(self) -> dict[str, JsonScalar]:
+        """What a checkpoint needs to continue bit for bit; config and seed are not part of it."""
+        return {
+            "rate": self._rate,
+            "revision": self._revision,
+            "episodes": self._episodes,
+            "crashed": self._crashed,
+        }
+
+    def load_state_dict(self, state: dict[str, JsonScalar]) -> None:
+        """Raises ValueError where keys are missing or left over, or the rate is out of range."""
+        if set(state) != set(self.state_dict()):
+            raise ValueError(
+                f"coach state has keys {sorted(state)}, expected {sorted(self.state_dict())}"
+            )
+        rate = float(state["rate"])
+        if not 0 <= rate <= 1:
+            raise ValueError(f"coach state: rate {rate} is not in [0, 1]")
+        self._rate = rate
+        self._revision = int(state["revision"])
+        self._episodes = int(state["episodes"])
+        self._crashed = int(state["crashed"])
