@@ -22,63 +22,78 @@ class CoachConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     strategy: str = Field(
-        "none", description="How the crash rate moves: none, fixed, curriculum, adaptive, or own."
+        default="none",
+        description="How the crash rate moves: none, fixed, curriculum, adaptive, or own.",
     )
     crash_rate: float = Field(
-        0.0, ge=0, le=1, description="Crash rate alpha of strategy fixed, per robot and episode."
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Crash rate alpha of strategy fixed, per robot and episode.",
     )
     crash_mode: Literal["mute", "stay", "random"] = Field(
-        "mute",
+        default="mute",
         description="What a crashed robot does: mute (no command arrives, it stays; stay is the "
         "paper's word for it) or random (a uniform available action each step).",
     )
     beta: float = Field(
-        0.75, ge=0, le=1, description="Adaptive: success rate from which the crash rate rises."
+        default=0.75,
+        ge=0,
+        le=1,
+        description="Adaptive: success rate from which the crash rate rises.",
     )
     rho: float = Field(
-        0.01, gt=0, le=1, description="Adaptive: share of the way moved per evaluation block."
+        default=0.01,
+        gt=0,
+        le=1,
+        description="Adaptive: share of the way moved per evaluation block.",
     )
     alpha_max: float | None = Field(
-        None,
+        default=None,
         ge=0,
         le=1,
         description="Highest crash rate; null: 0.1 for curriculum, 1.0 for adaptive.",
     )
     curriculum_fraction: float = Field(
-        0.5,
+        default=0.5,
         gt=0,
         le=1,
         description="Curriculum: part of training after which alpha_max is reached.",
     )
     curriculum_delta: float | None = Field(
-        None,
+        default=None,
         gt=0,
         le=1,
         description="Curriculum: increment per episode instead of curriculum_fraction; null: off.",
     )
     resample: bool = Field(
-        True, description="Discard draws with more crashed robots than cap_rule allows."
+        default=True, description="Discard draws with more crashed robots than cap_rule allows."
     )
     cap_rule: CapRule = Field(
-        "ceil",
+        default="ceil",
         description="Most robots of n that crash at rate a: ceil (n a), floor (n a, the paper), "
         "authors (n - round(n (1 - a)), the authors' code).",
     )
     max_crashed: int = Field(
-        -1, ge=-1, description="Never crash more robots than this; -1: no further limit."
+        default=-1, ge=-1, description="Never crash more robots than this; -1: no further limit."
     )
-    min_alive: int = Field(0, ge=0, description="Never leave fewer working robots than this.")
+    min_alive: int = Field(
+        default=0, ge=0, description="Never leave fewer working robots than this."
+    )
     victims: tuple[str, ...] = Field(
-        (), description="Robots that crash in every episode; empty: victims are drawn."
+        default=(), description="Robots that crash in every episode; empty: victims are drawn."
     )
     crashed_exactly: int = Field(
-        -1, ge=-1, description="Exactly this many random victims in every episode; -1: off."
+        default=-1, ge=-1, description="Exactly this many random victims in every episode; -1: off."
     )
     start_step: int = Field(
-        0, ge=0, lt=NEXT_STEP, description="First faulted control step of the episode."
+        default=0, ge=0, lt=NEXT_STEP, description="First faulted control step of the episode."
     )
     duration_steps: int = Field(
-        0, ge=0, lt=NEXT_STEP, description="Faulted control steps; 0: until the episode ends."
+        default=0,
+        ge=0,
+        lt=NEXT_STEP,
+        description="Faulted control steps; 0: until the episode ends.",
     )
 
     @field_validator("strategy")

@@ -28,9 +28,9 @@ def _splitmix64(x: UInt64Array) -> UInt64Array:
 
 
 def random_bits(
-    seed: int, episode: EpisodeArray, step: EpisodeArray, robot: IntArray
+    seed: int, episode: npt.ArrayLike, step: npt.ArrayLike, robot: npt.ArrayLike
 ) -> UInt64Array:
-    """64 uniform bits for each (episode, step, robot); the arrays broadcast together."""
+    """64 uniform bits for each (episode, step, robot); these broadcast together, at least 1-d."""
     key = _splitmix64(np.atleast_1d(np.uint64(seed)))
     for counter in (episode, step, robot):
         key = _splitmix64(key ^ np.asarray(counter).astype(np.uint64))
