@@ -1,0 +1,22 @@
+"""Executable ``team``: all robots' policies in one process, one forward pass per step."""
+
+from __future__ import annotations
+
+import sys
+
+from policy_pkg.ros.agent_node import AgentNode, spin
+
+
+class TeamNode(AgentNode):
+    """Parameters: checkpoint, command_topic; the robots come from the checkpoint."""
+
+    def __init__(self) -> None:
+        super().__init__("team", one_robot=False)
+
+
+def main() -> int:
+    return spin(TeamNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

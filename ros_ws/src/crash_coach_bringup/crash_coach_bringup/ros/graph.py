@@ -1,0 +1,183 @@
+"""What the ROS graph consists of: one command line per process, for every layout."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from crash_coach_pkg.config import CoachConfig
+from policy_pkg.checkpoint import load_policy
+from sim_pkg.contract import UserError
+from sim_pkg.env import make_env
+
+from crash_coach_bringup.ros.probe import find_executable
+
+Mode = Literal["lockstep", "realtime"]
+Layout = Literal["nodes", "team", "single"]
+Value = bool | int | float | str | Sequence[str]
+
+DOMAIN_LIMIT = 232  # rmw: higher ids have no valid UDP ports
+
+
+class GraphError(UserError):
+    """The graph cannot be started as asked; the text says what is wrong."""
+
+
+@dataclass(frozen=True)
+class UpOptions:
+    """A graph: which scenario, which policies, how many processes.
+
+    ``layout``: ``nodes`` has a policy process per robot, ``team`` one for all policies,
+    ``single`` one process for everything. ``coach`` holds the coach's settings at start;
+    ``sim`` further parameters of the sim. ``gate`` false leaves coach and gate out: the
+    policies command the robots directly.
+    """
+
+    scenario: str
+    checkpoint: Path
+    mode: Mode = "lockstep"
+    layout: Layout = "nodes"
+    seed: int = 0
+    episodes: int = 0  # 0: endless
+    autostart: bool = True
+    gate: bool = True
+    coach: CoachConfig = field(default_factory=CoachConfig)
+    sim: Mapping[str, Value] = field(default_factory=dict)
+    domain: int | None = None  # None: ROS_DOMAIN_ID, or 0
+    log_dir: Path = Path("runs/up")
+
+
+@dataclass(frozen=True)
+class Node:
+    """A ROS node: where it comes from, its name and its parameters."""
+
+    name: str
+    package: str
+    executable: str
+    parameters: Mapping[str, Value]
+
+    def arguments(self) -> list[str]:
+        """--ros-args for a process that holds this node only."""
+        return ros_arguments(["-r", f"__node:={self.name}"], "", self.parameters)
+
+
+@dataclass(frozen=True)
+class Process:
+    """One operating system process. ``name`` names its log file and is what errors say."""
+
+    name: str
+    argv: tuple[str, ...]
+
+
+def domain_id(options: UpOptions) -> int:
+    """The domain that the graph runs on. Raises GraphError for one that does not exist."""
+    text = os.environ.get("ROS_DOMAIN_ID", "") if options.domain is None else str(options.domain)
+    try:
+        domain = int(text or "0")
+    except ValueError:
+        raise GraphError(f"ROS_DOMAIN_ID is {text!r}, not a number") from None
+    if not 0 <= domain <= DOMAIN_LIMIT:
+        raise GraphError(f"ROS domain {domain} is not in 0..{DOMAIN_LIMIT}")
+    return domain
+
+
+def ros_arguments(start: list[str], prefix: str, parameters: Mapping[str, Value]) -> list[str]:
+    """--ros-args with ``start`` and one -p per parameter. JSON is YAML that keeps its types."""
+    arguments = ["--ros-args", *start]
+    for name, value in parameters.items():
+        plain = value if isinstance(value, bool | int | float | str) else list(value)
+        arguments += ["-p", f"{prefix}{name}:={json.dumps(plain)}"]
+    return [*arguments, "--"]
+
+
+def coach_parameters(config: CoachConfig, robots: Sequence[str], seed: int) -> dict[str, Value]:
+    """The coach node's parameters; settings that are null or default keep the node's default."""
+    chosen = config.model_dump(exclude_defaults=True, exclude_none=True)
+    return {"robots": list(robots), "seed": seed, "strategy": config.strategy, **chosen}
+
+
+def check_team(options: UpOptions) -> tuple[str, ...]:
+    """Loads scenario and checkpoint and returns the robots' names.
+
+    Raises:
+        GraphError: a checkpoint of another team than the scenario's.
+        sim_pkg.config.ConfigError: no such scenario.
+        policy_pkg.checkpoint.CheckpointError: not a usable checkpoint.
+    """
+    spec = make_env(options.scenario, 1).spec
+    bundle = load_policy(options.checkpoint)
+    for what, has, needs in (
+        ("robots", len(bundle.robots), spec.n_robots),
+        ("observation features", bundle.obs_size, spec.obs_size),
+        ("actions", bundle.n_actions, spec.n_actions),
+    ):
+        if has != needs:
+            raise GraphError(
+                f"checkpoint {options.checkpoint} was trained on {bundle.scenario!r} for "
+                f"{has} {what}; scenario {options.scenario!r} has {needs}"
+            )
+    return spec.robots
+
+
+def graph_nodes(options: UpOptions, robots: Sequence[str]) -> list[Node]:
+    """The graph's nodes, the sim last: the others are ready to answer when it starts."""
+    checkpoint = str(options.checkpoint.resolve())
+    acting: dict[str, Value] = {
+        "checkpoint": checkpoint,
+        "command_topic": "command_raw" if options.gate else "command",
+    }
+    nodes: list[Node] = []
+    if options.gate:
+        coach = coach_parameters(options.coach, robots, options.seed)
+        gate = {"robots": list(robots), "lockstep": options.mode == "lockstep"}
+        nodes += [
+            Node("gate", "crash_coach_pkg", "gate", gate),
+            Node("coach", "crash_coach_pkg", "coach", coach),
+        ]
+    if options.layout == "nodes":
+        nodes += [
+            Node(f"policy_{name}", "policy_pkg", "policy", {"robot": name, **acting})
+            for name in robots
+        ]
+    else:
+        nodes.append(Node("team", "policy_pkg", "team", acting))
+    sim: dict[str, Value] = {
+        "scenario": options.scenario,
+        "mode": options.mode,
+        "seed": options.seed,
+        "episodes": options.episodes,
+        "autostart": options.autostart,
+        **options.sim,
+    }
+    return [*nodes, Node("sim", "sim_pkg", "sim", sim)]
+
+
+def graph_processes(options: UpOptions, robots: Sequence[str]) -> list[Process]:
+    """The processes of the layout. Raises GraphError where an executable is not installed."""
+    nodes = graph_nodes(options, robots)
+    if options.layout == "single":
+        return [single_process(nodes)]
+    return [node_process(node) for node in nodes]
+
+
+def node_process(node: Node) -> Process:
+    """The process of a node's own. Raises GraphError where its executable is not installed."""
+    try:
+        executable = find_executable(node.package, node.executable)
+    except FileNotFoundError as error:
+        raise GraphError(str(error)) from None
+    return Process(node.name, (str(executable), *node.arguments()))
+
+
+def single_process(nodes: Sequence[Node]) -> Process:
+    """All nodes in one process: parameters carry their node's name."""
+    arguments: list[str] = []
+    for node in nodes:
+        arguments += ros_arguments([], f"{node.name}:", node.parameters)
+    module = "crash_coach_bringup.ros.single"
+    return Process("graph", (sys.executable, "-m", module, *arguments))

@@ -1,0 +1,83 @@
+"""``crash-coach up``: the graph under supervision until it ends, dies or is interrupted."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from rclpy.context import Context
+from rclpy.node import Node
+
+from crash_coach_bringup.ros.graph import (
+    GraphError,
+    UpOptions,
+    check_team,
+    domain_id,
+    graph_processes,
+)
+from crash_coach_bringup.ros.supervisor import Event, Supervisor, watch
+
+DISCOVERY_S = 1.0  # how long another sim on this machine is looked for
+LOOK_S = 0.05
+
+
+def run_up(options: UpOptions, on_event: Callable[[Event], None]) -> int:
+    """Runs the graph; returns the exit code: 0 after the last episode, 1 after a death, 130.
+
+    ``on_event`` hears what happens as it happens. Call it from the main thread: SIGINT,
+    SIGTERM and SIGHUP stop the graph in order while it runs.
+
+    Raises:
+        GraphError: a checkpoint that does not fit, a missing executable, a bad domain, or a
+            sim that already runs on the domain.
+        sim_pkg.config.ConfigError, policy_pkg.checkpoint.CheckpointError: as check_team.
+        OSError: a log cannot be written.
+    """
+    domain = domain_id(options)
+    processes = graph_processes(options, check_team(options))
+    refuse_second_sim(domain)
+    with stop_signals() as interrupted, Supervisor(processes, options.log_dir, domain) as running:
+        for name, pid in running.pids().items():
+            on_event(Event("started", name, f"process {pid}, log {running.log_of(name)}"))
+        exit_code = watch(running, ("sim", "graph"), interrupted, on_event)
+    on_event(Event("stopped", "", f"no process is left on domain {domain}"))
+    return exit_code
+
+
+def refuse_second_sim(domain: int) -> None:
+    """Raises GraphError where a sim already runs on the domain."""
+    context = Context()
+    context.init(args=[], domain_id=domain)
+    try:
+        node = Node("crash_coach_up", context=context, use_global_arguments=False)
+        deadline = time.monotonic() + DISCOVERY_S
+        while time.monotonic() < deadline:
+            if node.count_publishers("/sim/episode"):
+                raise GraphError(
+                    f"a sim already runs on ROS domain {domain}: stop it, or set another "
+                    "ROS_DOMAIN_ID"
+                )
+            time.sleep(LOOK_S)
+        node.destroy_node()
+    finally:
+        context.try_shutdown()
+
+
+@contextmanager
+def stop_signals() -> Iterator[Callable[[], bool]]:
+    """Turns SIGINT, SIGTERM and SIGHUP into a flag, so that stopping is never cut short."""
+    received: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, note) for number in numbers}
+    try:
+        yield lambda: bool(received)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
