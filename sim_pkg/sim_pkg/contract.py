@@ -19,6 +19,14 @@ EpisodeArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
 
+class UserError(ValueError):
+    """Something the user can mend; the text names the thing, the place and what is right.
+
+    Command lines and nodes print it as one line and exit with 1. Every other exception is a
+    defect and keeps its traceback.
+    """
+
+
 @dataclass(frozen=True)
 class EnvSpec:
     """What a scenario promises; constant while an environment lives.
