@@ -1,0 +1,200 @@
+"""Strict loading of YAML: the only place of this package that reads it.
+
+A wrong file is refused with its name, the line, the key, the value and what would be right;
+nothing is guessed and no key is ignored.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Hashable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+SCENARIOS_DIR = Path(__file__).parent / "configs" / "scenarios"
+
+_Location = tuple[int | str, ...]
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used; the text says where, what, and what is right."""
+
+
+class StrictModel(BaseModel):
+    """Base of every configuration: frozen, no unknown key, no NaN, no infinity."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+ModelT = TypeVar("ModelT", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class YamlTree:
+    """A parsed YAML mapping and the line of each of its keys and items."""
+
+    path: Path
+    values: dict[str, Any]
+    lines: dict[_Location, int]
+
+    def where(self, location: _Location) -> str:
+        """``file:line`` of the deepest part of ``location`` that the file contains."""
+        for depth in range(len(location), -1, -1):
+            line = self.lines.get(location[:depth])
+            if line is not None:
+                return f"{self.path}:{line}"
+        return str(self.path)
+
+
+class _Loader(yaml.SafeLoader):
+    """SafeLoader that reads 1e-3 as a number (YAML 1.2) and not as text (YAML 1.1)."""
+
+
+_Loader.add_implicit_resolver(  # type: ignore[no-untyped-call]
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"),
+    list("-+0123456789."),
+)
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """" (did you mean 'x'?)" for the closest known name, or nothing."""
+    close = difflib.get_close_matches(name, list(known), n=1)
+    return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+def load_tree(path: Path) -> YamlTree:
+    """Reads a YAML mapping.
+
+    Raises:
+        ConfigError: unreadable, not YAML, not a mapping, or a key that occurs twice.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not UTF-8 text") from error
+    loader = _Loader(text)
+    try:
+        node = loader.get_single_node()
+        if not isinstance(node, yaml.MappingNode):
+            raise ConfigError(f"{path}: expected a mapping of keys to values")
+        lines: dict[_Location, int] = {}
+        _index_lines(path, node, (), lines)
+        values = loader.construct_document(node)  # type: ignore[no-untyped-call]
+    except yaml.MarkedYAMLError as error:
+        line = f":{error.problem_mark.line + 1}" if error.problem_mark else ""
+        raise ConfigError(f"{path}{line}: not valid YAML: {error.problem}") from error
+    finally:
+        loader.dispose()  # type: ignore[no-untyped-call]
+    return YamlTree(path, values, lines)
+
+
+def validate(tree: YamlTree, model: type[ModelT]) -> ModelT:
+    """The tree as a model.
+
+    Raises:
+        ConfigError: for the first thing that is wrong, with the number of further ones.
+    """
+    try:
+        return model.model_validate(tree.values)
+    except ValidationError as error:
+        problems = error.errors(include_url=False)
+        text = _describe(tree, model, dict(problems[0]))
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        raise ConfigError(text + more) from error
+
+
+def load_yaml_strict(path: Path, model: type[ModelT]) -> ModelT:
+    """Reads ``path`` as ``model``.
+
+    Raises:
+        ConfigError: the file cannot be read or says something that the model does not allow.
+    """
+    return validate(load_tree(path), model)
+
+
+def _index_lines(
+    path: Path, node: yaml.Node, location: _Location, lines: dict[_Location, int]
+) -> None:
+    """Notes the line of every key and item below ``node``; refuses a key given twice."""
+    if isinstance(node, yaml.MappingNode):
+        for key_node, value_node in node.value:
+            key: Hashable = getattr(key_node, "value", None)
+            here = (*location, str(key))
+            line = key_node.start_mark.line + 1
+            if here in lines:
+                raise ConfigError(f"{path}:{line}: key {key!r} again, first in line {lines[here]}")
+            lines[here] = line
+            _index_lines(path, value_node, here, lines)
+    elif isinstance(node, yaml.SequenceNode):
+        for index, item in enumerate(node.value):
+            lines[(*location, index)] = item.start_mark.line + 1
+            _index_lines(path, item, (*location, index), lines)
+
+
+def _describe(tree: YamlTree, model: type[BaseModel], problem: dict[str, Any]) -> str:
+    location: _Location = problem["loc"]
+    name = ".".join(str(part) for part in location) or "the file"
+    where = tree.where(location)
+    if problem["type"] == "extra_forbidden":
+        known = _known_keys(model, location[:-1])
+        hint = did_you_mean(str(location[-1]), known)
+        return f"{where}: unknown key {name!r}{hint}; known keys: {', '.join(known)}"
+    if problem["type"] == "missing":
+        return f"{where}: key {name!r} is missing"
+    message = str(problem["msg"]).removeprefix("Value error, ")
+    if isinstance(problem["input"], dict):
+        return f"{where}: {message}" if not location else f"{where}: {name}: {message}"
+    return f"{where}: {name} = {problem['input']!r}: {message}"
+
+
+def _known_keys(model: type[BaseModel], location: _Location) -> list[str]:
+    """The keys that a model accepts at ``location``."""
+    kind: Any = model
+    for part in location:
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            if part not in kind.model_fields:
+                return []
+            kind = kind.model_fields[str(part)].annotation
+        kind = _inner_model(kind)
+    return sorted(kind.model_fields) if kind is not None else []
+
+
+def _inner_model(kind: Any) -> type[BaseModel] | None:
+    """The model inside an annotation such as ``tuple[Model, ...]`` or ``Model | None``."""
+    if isinstance(kind, type) and issubclass(kind, BaseModel):
+        return kind
+    return next((inner for inner in map(_inner_model, get_args(kind)) if inner), None)
+
+
+def scenario_names() -> tuple[str, ...]:
+    """Names of the shipped scenarios, sorted; ``skirmish/3m`` for a file in a folder."""
+    files = SCENARIOS_DIR.rglob("*.yaml")
+    return tuple(sorted(f.relative_to(SCENARIOS_DIR).with_suffix("").as_posix() for f in files))
+
+
+def find_scenario(scenario: str | Path) -> Path:
+    """The file of a shipped scenario's name, or of a path.
+
+    Raises:
+        ConfigError: neither a known name nor an existing file.
+    """
+    known = scenario_names()
+    if isinstance(scenario, str) and scenario in known:
+        return SCENARIOS_DIR / f"{scenario}.yaml"
+    path = Path(scenario)
+    if path.suffix in {".yaml", ".yml"}:
+        if path.is_file():
+            return path
+        raise ConfigError(f"no scenario file {str(scenario)!r}")
+    raise ConfigError(
+        f"unknown scenario {str(scenario)!r}{did_you_mean(str(scenario), known)}; "
+        f"known: {', '.join(known)}, or the path of a .yaml file"
+    )

@@ -1,0 +1,100 @@
+"""What a scenario supplies; env.py composes it with the physics.
+
+Shapes: B arenas, n robots, d discs (the robots are the first n), O, S and A as in contract.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from sim_pkg.config import StrictModel
+from sim_pkg.contract import BoolArray, EnvSpec, FloatArray, IntArray, RewardArray
+from sim_pkg.world import Float64Array, WorldSpec
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What can be drawn of a scenario; metres."""
+
+    arena_m: tuple[float, float]  # width, height; the south-west corner is (0, 0)
+    cell_m: float  # side of a grid cell; 0: no grid
+    radii_m: tuple[float, ...]  # of each robot
+    sites_m: tuple[tuple[float, float], ...]  # centres of the m places that the task is about
+
+
+@dataclass(frozen=True)
+class Buffers:
+    """The environment's arrays, allocated once and filled by the scenario."""
+
+    obs: FloatArray  # (B, n, O)
+    state: FloatArray  # (B, S)
+    available: BoolArray  # (B, n, A)
+    reward: RewardArray  # (B,)
+    terminated: BoolArray  # (B,)
+    truncated: BoolArray  # (B,)
+    success: BoolArray  # (B,)
+    sites_done: BoolArray  # (B, m)
+
+    @classmethod
+    def allocate(cls, spec: EnvSpec, n_sites: int, n_arenas: int) -> Buffers:
+        n, b = spec.n_robots, n_arenas
+        return cls(
+            obs=np.zeros((b, n, spec.obs_size), dtype=np.float32),
+            state=np.zeros((b, spec.state_size), dtype=np.float32),
+            available=np.ones((b, n, spec.n_actions), dtype=np.bool_),
+            reward=np.zeros(b, dtype=np.float64),
+            terminated=np.zeros(b, dtype=np.bool_),
+            truncated=np.zeros(b, dtype=np.bool_),
+            success=np.zeros(b, dtype=np.bool_),
+            sites_done=np.zeros((b, n_sites), dtype=np.bool_),
+        )
+
+
+class Scenario(Protocol):
+    """The rules of one task over B arenas. ``bodies`` and ``commands`` are World's."""
+
+    spec: EnvSpec
+    world: WorldSpec
+    scene: Scene
+
+    def begin(self, arena: int, seed: int, episode: int) -> Float64Array:
+        """Forgets ``arena``'s last episode; (d, 2) start positions in m of the new one."""
+        ...
+
+    def observe(self, running: BoolArray, bodies: Float64Array, out: Buffers) -> None:
+        """Fills obs, state, available and sites_done of the running arenas."""
+        ...
+
+    def command(
+        self, running: BoolArray, actions: IntArray, bodies: Float64Array, commands: Float64Array
+    ) -> None:
+        """Turns the running arenas' actions (B, n) into commanded velocities."""
+        ...
+
+    def settle(self, running: BoolArray, bodies: Float64Array, out: Buffers) -> None:
+        """After the physics: fills reward and flags of every arena (0 and False where it does
+        not run), then observes."""
+        ...
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of scenario: its configuration and how to build it (config, name, n_arenas)."""
+
+    config: type[StrictModel]
+    build: Callable[[Any, str, int], Scenario]
+
+
+def robot_names(n: int) -> tuple[str, ...]:
+    return tuple(f"robot_{i + 1}" for i in range(n))
+
+
+def episode_rng(seed: int, episode: int) -> np.random.Generator:
+    """The generator of everything random in an episode, keyed by (seed, episode) alone."""
+    key: npt.NDArray[np.uint64] = np.array([seed, episode], dtype=np.uint64)
+    return np.random.Generator(np.random.Philox(key=key))
