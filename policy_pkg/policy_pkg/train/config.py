@@ -1,0 +1,150 @@
+"""Training settings: the schema, and strict loading of a file with ``--set`` overrides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+import yaml
+from crash_coach_pkg.config import CoachConfig
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from sim_pkg.config import ConfigError, YamlTree, did_you_mean, load_tree, validate
+
+from policy_pkg.train.learner_config import LearnerConfig
+
+CONFIGS_DIR = Path(__file__).parent.parent / "configs"
+
+
+class TrainConfig(BaseModel):
+    """One training run. The defaults are the paper's; ``configs/train/buttons/qmix.yaml`` says
+    the same with comments."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    scenario: str = Field(description="shipped scenario's name, or path of a .yaml file")
+    seed: int = Field(0, ge=0, lt=2**63, description="keys everything that is drawn")
+    total_steps: int = Field(2_000_000, ge=1, description="environment steps, all arenas counted")
+    n_envs: int = Field(8, ge=1, le=4096, description="arenas that run side by side")
+    updates_per_episode: float = Field(
+        1.0, gt=0, le=64, description="gradient steps per finished episode; credit adds up"
+    )
+    batch_episodes: int = Field(32, ge=1, description="episodes of one gradient step")
+    replay_episodes: int = Field(5_000, ge=1, description="episodes that the replay keeps")
+    epsilon_start: float = Field(1.0, ge=0, le=1, description="exploration at the start")
+    epsilon_finish: float = Field(0.05, ge=0, le=1, description="exploration after annealing")
+    epsilon_anneal_steps: int = Field(
+        50_000, ge=1, description="environment steps over which epsilon falls linearly"
+    )
+    test_interval_steps: int = Field(
+        10_000, ge=1, description="environment steps between two evaluation blocks"
+    )
+    test_episodes: int = Field(32, ge=1, description="greedy episodes of an evaluation block")
+    test_crash_free: bool = Field(
+        True, description="play each block's episodes without crashes too, for the learning curve"
+    )
+    checkpoint_interval_steps: int = Field(
+        100_000, ge=1, description="environment steps between two checkpoints, at block ends"
+    )
+    checkpoint_replay: bool = Field(
+        True, description="save the replay: without it, resuming starts with an empty one"
+    )
+    tensorboard: bool = Field(True, description="write the metrics for TensorBoard as well")
+    learner: LearnerConfig = Field(default_factory=LearnerConfig)  # type: ignore[arg-type]
+    coach: CoachConfig = Field(default_factory=CoachConfig)  # type: ignore[arg-type]
+
+    @model_validator(mode="after")
+    def _batch_fits_replay(self) -> Self:
+        if self.batch_episodes > self.replay_episodes:
+            raise ValueError(
+                f"batch_episodes {self.batch_episodes} is more than replay_episodes "
+                f"{self.replay_episodes}: learning would never start"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _epsilon_falls(self) -> Self:
+        if self.epsilon_finish > self.epsilon_start:
+            raise ValueError(
+                f"epsilon_finish {self.epsilon_finish} is above epsilon_start {self.epsilon_start}"
+            )
+        return self
+
+    def epsilon(self, env_steps: int) -> float:
+        """Linear from ``epsilon_start`` to ``epsilon_finish``, then constant."""
+        done = min(1.0, env_steps / self.epsilon_anneal_steps)
+        return self.epsilon_start + (self.epsilon_finish - self.epsilon_start) * done
+
+
+@dataclass(frozen=True)
+class _Overridden(YamlTree):
+    """A tree in which some values come from the command line."""
+
+    overrides: dict[tuple[str, ...], str] = field(default_factory=dict)
+
+    def where(self, location: tuple[int | str, ...]) -> str:
+        for keys, text in self.overrides.items():
+            if location[: len(keys)] == keys:
+                return f"--set {text}"
+        return super().where(location)
+
+
+def train_config_names() -> tuple[str, ...]:
+    """Names of the shipped training configs, such as ``buttons/qmix``; sorted."""
+    files = CONFIGS_DIR.rglob("*.yaml")
+    return tuple(sorted(f.relative_to(CONFIGS_DIR).with_suffix("").as_posix() for f in files))
+
+
+def load_train_config(
+    source: str | Path, overrides: Sequence[str] = (), seed: int | None = None
+) -> TrainConfig:
+    """Reads a training config.
+
+    Args:
+        source: a shipped config's name, with or without ``.yaml``, or a path.
+        overrides: ``key=value`` or ``section.key=value``; values are read as YAML.
+        seed: replaces the config's.
+
+    Raises:
+        ConfigError: names the file and line or the override, the key, the value, what is right.
+    """
+    tree = load_tree(_find(source))
+    given: dict[tuple[str, ...], str] = {}
+    for text in [*overrides, *([] if seed is None else [f"seed={seed}"])]:
+        keys = _apply(tree.values, text)
+        given[keys] = text
+    return validate(_Overridden(tree.path, tree.values, tree.lines, given), TrainConfig)
+
+
+def _find(source: str | Path) -> Path:
+    known = train_config_names()
+    name = str(source).removesuffix(".yaml")
+    if name in known and not Path(source).is_file():
+        return CONFIGS_DIR / f"{name}.yaml"
+    path = Path(source)
+    if path.suffix in {".yaml", ".yml"} and path.is_file():
+        return path
+    raise ConfigError(
+        f"no training config {str(source)!r}{did_you_mean(name, known)}; "
+        f"known: {', '.join(known)}, or the path of a .yaml file"
+    )
+
+
+def _apply(values: dict[str, Any], text: str) -> tuple[str, ...]:
+    """Puts one override into ``values``; returns the keys that lead to it."""
+    key, equals, value = text.partition("=")
+    keys = tuple(key.strip().split("."))
+    if not equals or not all(keys):
+        raise ConfigError(f"--set {text}: expected key=value or section.key=value")
+    try:
+        parsed = yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"--set {text}: {value!r} is not a YAML value") from error
+    place = values
+    for part in keys[:-1]:
+        place = place.setdefault(part, {})
+        if not isinstance(place, dict):
+            raise ConfigError(f"--set {text}: {part!r} is a value, not a section")
+    place[keys[-1]] = parsed
+    return keys
