@@ -1,0 +1,184 @@
+"""`crash-coach evaluate`: what a trained team achieves, crash-free and with crashes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from crash_coach_pkg.config import CoachConfig
+from policy_pkg.checkpoint import PolicyBundle, load_policy
+from policy_pkg.train.evaluate import Condition, Evaluation
+from policy_pkg.train.evaluate import evaluate as evaluate_in_core
+from pydantic import ValidationError
+from sim_pkg.trajectory import combine
+
+from crash_coach_bringup.cli.output import (
+    CliError,
+    check_json_target,
+    console,
+    percent_ci,
+    table,
+    write_json,
+)
+
+
+class CrashMode(StrEnum):
+    stay = "stay"
+    mute = "mute"
+    random = "random"
+
+
+class Via(StrEnum):
+    core = "core"
+    ros = "ros"
+
+
+class Layout(StrEnum):
+    nodes = "nodes"
+    team = "team"
+    single = "single"
+
+
+def crash_config(option: str, **settings: Any) -> CoachConfig:
+    """A CoachConfig from one option's value, its errors told as that option's."""
+    try:
+        return CoachConfig(**settings)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise CliError(f"{option} {first['input']}: {first['msg']}") from None
+
+
+def conditions(
+    robots: tuple[str, ...],
+    rates: list[float],
+    crashed: list[int],
+    victims: list[str],
+    mode: CrashMode,
+) -> list[Condition]:
+    """What to evaluate under, in the order rates, counts, victims; crash-free without any."""
+    out = []
+    for rate in rates:
+        crash = crash_config(
+            "--crash-rate", strategy="fixed", crash_rate=rate, resample=False, crash_mode=mode.value
+        )
+        out.append(Condition(f"crash rate {rate:g}", crash))
+    for count in crashed:
+        if not 0 <= count <= len(robots):
+            raise CliError(f"--crashed {count}: the team has {len(robots)} robots")
+        crash = crash_config(
+            "--crashed", strategy="fixed", crashed_exactly=count, crash_mode=mode.value
+        )
+        out.append(Condition(f"{count} crashed", crash))
+    if victims:
+        for name in victims:
+            if name not in robots:
+                raise CliError(f"--victims {name}: unknown robot; one of: {', '.join(robots)}")
+        crash = crash_config(
+            "--victims", strategy="fixed", victims=tuple(victims), crash_mode=mode.value
+        )
+        out.append(Condition(f"{', '.join(victims)} crashed", crash))
+    return out or [Condition("crash-free", CoachConfig(strategy="none"))]
+
+
+def evaluator(
+    checkpoint: Path, bundle: PolicyBundle, scenario: str, via: Via, layout: Layout
+) -> Callable[[Condition, int, int], Evaluation]:
+    """(condition, episodes, seed) -> Evaluation, in this process or as a ROS graph."""
+    if via is Via.core:
+        return lambda condition, episodes, seed: evaluate_in_core(
+            bundle, scenario, condition, episodes, seed
+        )
+    from crash_coach_bringup.ros.evaluation import evaluate_via_ros
+
+    return lambda condition, episodes, seed: evaluate_via_ros(
+        checkpoint, scenario, condition, episodes, seed, layout.value
+    )
+
+
+def show(title: str, results: list[tuple[Condition, Evaluation]]) -> None:
+    rows = table(title, ["condition", "success (95 % interval)", "return", "steps", "crashed"])
+    for condition, result in results:
+        figures = result.summary()
+        rows.add_row(
+            condition.name,
+            percent_ci(figures["success_rate"], figures["success_ci95"]),
+            f"{figures['return_mean']:.2f} ± {figures['return_std']:.2f}",
+            f"{figures['steps_mean']:.1f}",
+            f"{100 * figures['crashed_fraction']:.1f} %",
+        )
+    console.print(rows)
+
+
+def as_json(results: list[tuple[Condition, Evaluation]]) -> list[dict[str, Any]]:
+    """Each condition's summary and episodes, without the positions."""
+    out = []
+    for condition, result in results:
+        episodes = [asdict(episode) for episode in result.episodes]
+        for episode in episodes:
+            episode.pop("positions_m", None)
+        out.append(
+            {
+                "name": condition.name,
+                "crash": condition.crash.model_dump(mode="json"),
+                **result.summary(),
+                "per_episode": episodes,
+            }
+        )
+    return out
+
+
+def evaluate(
+    checkpoint: Annotated[Path, typer.Argument(help="Run directory or checkpoint directory.")],
+    scenario: Annotated[
+        str | None, typer.Option(help="Scenario name or YAML file; default: the checkpoint's.")
+    ] = None,
+    episodes: Annotated[int, typer.Option(help="Episodes per condition.", min=1)] = 128,
+    crash_rate: Annotated[
+        list[float] | None, typer.Option(help="R ...: each robot crashes with probability R.")
+    ] = None,
+    crashed: Annotated[
+        list[int] | None, typer.Option(help="K ...: exactly K robots, drawn anew each episode.")
+    ] = None,
+    victims: Annotated[
+        list[str] | None, typer.Option(help="ROBOT ...: these robots, in every episode.")
+    ] = None,
+    mode: Annotated[CrashMode, typer.Option(help="What a crashed robot does.")] = CrashMode.stay,
+    via: Annotated[
+        Via, typer.Option(help="In this process, or as a real ROS graph in lock-step.")
+    ] = Via.core,
+    layout: Annotated[
+        Layout,
+        typer.Option(help="With ROS: a process per node, one for the team, or a single process."),
+    ] = Layout.nodes,
+    seed: Annotated[int, typer.Option(help="Seed of episodes, victims, random actions.", min=0)] = 0,
+    json: Annotated[Path | None, typer.Option(help="Also write the result to this file.")] = None,
+) -> None:
+    """Evaluates a trained team greedily; without a crash option, crash-free."""
+    check_json_target(json)
+    bundle = load_policy(checkpoint)
+    name = scenario or bundle.scenario
+    asked = conditions(bundle.robots, crash_rate or [], crashed or [], victims or [], mode)
+    run = evaluator(checkpoint, bundle, name, via, layout)
+    results = [(condition, run(condition, episodes, seed)) for condition in asked]
+    show(f"{checkpoint} on {name}: {episodes} episodes each, seed {seed}, via {via}", results)
+    summaries = as_json(results)
+    trajectory_hash = combine(row["trajectory_hash"] for row in summaries)
+    console.print(f"trajectory hash {trajectory_hash}", soft_wrap=True)
+    write_json(
+        json,
+        {
+            "checkpoint": str(checkpoint),
+            "scenario": name,
+            "via": via.value,
+            "layout": layout.value if via is Via.ros else None,
+            "seed": seed,
+            "episodes": episodes,
+            "mode": mode.value,
+            "trajectory_hash": trajectory_hash,
+            "conditions": summaries,
+        },
+    )

@@ -1,0 +1,167 @@
+"""Runs trainings side by side, one single-threaded process each, with a progress bar each."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import queue
+import signal
+import traceback
+from dataclasses import dataclass
+from multiprocessing.queues import Queue
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from sim_pkg.contract import UserError
+
+from crash_coach_bringup.cli.output import console
+
+if TYPE_CHECKING:
+    from multiprocessing.process import BaseProcess
+
+    from policy_pkg.train.config import TrainConfig
+
+POLL_S = 0.2
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training run."""
+
+    name: str
+    config: TrainConfig
+    out_dir: Path
+    resume: bool
+
+
+@dataclass(frozen=True)
+class Message:
+    """What a training process tells its parent."""
+
+    job: int
+    kind: str  # "progress", "done" or "failed"
+    content: Any  # ProgressReport, TrainSummary, or the error's text
+
+
+def _work(index: int, job: Job, parent: int, out: Queue[Message]) -> None:
+    """A training process; ends by itself where its parent is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    # Imported here: only training processes need torch.
+    from policy_pkg.train.trainer import train
+
+    def report(progress: Any) -> None:
+        if os.getppid() != parent:
+            os._exit(1)
+        out.put(Message(index, "progress", progress))
+
+    try:
+        summary = train(job.config, job.out_dir, resume=job.resume, progress=report)
+    except UserError as error:
+        out.put(Message(index, "failed", str(error)))
+    except Exception:  # noqa: BLE001 - a defect: its traceback belongs to the parent's output
+        out.put(Message(index, "failed", traceback.format_exc()))
+    else:
+        out.put(Message(index, "done", summary))
+
+
+def _progress_bars() -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=24),
+        TextColumn("{task.percentage:3.0f} %"),
+        TextColumn("{task.fields[figures]}"),
+        console=console,
+    )
+
+
+def _figures(report: Any) -> str:
+    """One line of a ProgressReport."""
+    success = "-" if report.success_rate is None else f"{report.success_rate:.2f}"
+    minutes, seconds = divmod(int(report.eta_s), 60)
+    return (
+        f"alpha {report.alpha:.3f}  success {success}  "
+        f"{report.steps_per_s:,.0f} steps/s  left {minutes}:{seconds:02d}"
+    )
+
+
+class _Runner:
+    """Starts jobs as workers become free and gathers what they say."""
+
+    def __init__(self, jobs: list[Job], workers: int, bars: Progress) -> None:
+        self.jobs = jobs
+        self.workers = workers
+        self.bars = bars
+        self.context = multiprocessing.get_context("spawn")
+        self.messages: Queue[Message] = self.context.Queue()
+        self.waiting = list(range(len(jobs)))
+        self.running: dict[int, BaseProcess] = {}
+        self.tasks: dict[int, TaskID] = {}
+        self.results: dict[int, Any] = {}
+        self.errors: dict[int, str] = {}
+
+    def start_free(self) -> None:
+        while self.waiting and len(self.running) < self.workers:
+            index = self.waiting.pop(0)
+            job = self.jobs[index]
+            self.tasks[index] = self.bars.add_task(job.name, total=1.0, figures="starting")
+            process = self.context.Process(
+                target=_work, args=(index, job, os.getpid(), self.messages), daemon=True
+            )
+            process.start()
+            self.running[index] = process
+
+    def take(self, message: Message) -> None:
+        task = self.tasks[message.job]
+        if message.kind == "progress":
+            report = message.content
+            self.bars.update(task, completed=report.env_steps / report.total_steps)
+            self.bars.update(task, figures=_figures(report))
+            return
+        if message.kind == "done":
+            self.results[message.job] = message.content
+            self.bars.update(task, completed=1.0)
+        else:
+            self.errors[message.job] = message.content
+            self.bars.update(task, figures="[red]failed[/red]")
+        self.running.pop(message.job).join()
+
+    def reap(self) -> None:
+        """A process that died without a word, say by the kernel's memory killer."""
+        for index, process in list(self.running.items()):
+            if not process.is_alive() and self.messages.empty():
+                self.errors[index] = f"the training process died, exit code {process.exitcode}"
+                self.bars.update(self.tasks[index], figures="[red]died[/red]")
+                del self.running[index]
+
+    def run(self) -> None:
+        try:
+            while self.waiting or self.running:
+                self.start_free()
+                try:
+                    self.take(self.messages.get(timeout=POLL_S))
+                except queue.Empty:
+                    self.reap()
+        finally:
+            for process in self.running.values():
+                process.terminate()
+                process.join()
+
+
+def run_jobs(jobs: list[Job], workers: int | None = None) -> list[Any]:
+    """Trains every job, at most one per core at a time.
+
+    Returns:
+        Each job's TrainSummary, in the order of ``jobs``.
+
+    Raises:
+        UserError: some failed; the others were finished first. Names each with its error.
+    """
+    workers = workers or len(os.sched_getaffinity(0))
+    with _progress_bars() as bars:
+        runner = _Runner(jobs, workers, bars)
+        runner.run()
+    if runner.errors:
+        lines = [f"{jobs[index].name}: {text}" for index, text in sorted(runner.errors.items())]
+        raise UserError("\n".join(lines))
+    return [runner.results[index] for index in range(len(jobs))]

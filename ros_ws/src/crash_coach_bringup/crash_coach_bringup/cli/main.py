@@ -1,0 +1,61 @@
+"""`crash-coach`: the verbs, and errors turned into one line and an exit code."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import typer
+from sim_pkg.contract import UserError
+
+from crash_coach_bringup.cli import demo, doctor, evaluate, inject, train, up
+
+# Options that take several values, up to the next option: --crashed 0 1 2
+SEVERAL = {"--crash-rate", "--crashed", "--victims", "--set", "--seed"}
+
+app = typer.Typer(
+    name="crash-coach",
+    help="Crash robots of a team on purpose: see what it costs, train it away.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+app.command("doctor")(doctor.doctor)
+app.command("train")(train.train)
+app.command("evaluate")(evaluate.evaluate)
+app.command("up")(up.up)
+app.command("inject")(inject.inject)
+app.command("demo")(demo.demo)
+
+
+def repeat_options(arguments: list[str]) -> list[str]:
+    """['--crashed', '0', '1'] -> ['--crashed', '0', '--crashed', '1']"""
+    out: list[str] = []
+    option, values = "", 0
+    for argument in arguments:
+        if argument.startswith("-") and not argument.lstrip("-")[:1].isdigit():
+            option, values = argument, 0
+        elif option in SEVERAL:
+            values += 1
+            if values > 1:
+                out.append(option)
+        out.append(argument)
+    return out
+
+
+def main() -> None:
+    # One thread per process, also where the shell did not say so.
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    try:
+        app(args=repeat_options(sys.argv[1:]))
+    except UserError as error:
+        print(f"crash-coach: error: {error}", file=sys.stderr)  # noqa: T201
+        sys.exit(1)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,57 @@
+"""What every verb shares: the console, errors as one line, results as JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from sim_pkg.contract import UserError
+
+console = Console()
+
+
+class CliError(UserError):
+    """A wrong command line."""
+
+
+def write_json(path: Path | None, result: Mapping[str, Any]) -> None:
+    """Writes ``result`` whole or not at all; does nothing without a path.
+
+    Raises:
+        CliError: the folder does not exist or cannot be written.
+    """
+    if path is None:
+        return
+    partial = path.with_name(path.name + ".partial")
+    try:
+        with open(partial, "w") as out:
+            json.dump(result, out, indent=2)
+            out.write("\n")
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise CliError(f"--json {path}: {error.strerror}: {error.filename}") from None
+
+
+def check_json_target(path: Path | None) -> None:
+    """Refuses a --json target in a missing folder before the work, not after it."""
+    if path is not None and not path.absolute().parent.is_dir():
+        raise CliError(f"--json {path}: there is no folder {path.absolute().parent}")
+
+
+def table(title: str, columns: list[str]) -> Table:
+    """A table whose first column is text and whose others are figures."""
+    out = Table(title=title, title_justify="left")
+    for index, column in enumerate(columns):
+        out.add_column(column, justify="left" if index == 0 else "right")
+    return out
+
+
+def percent_ci(rate: float, interval: tuple[float, float] | list[float]) -> str:
+    """'87.5 % (79.0..93.1)'"""
+    return f"{100 * rate:.1f} % ({100 * interval[0]:.1f}..{100 * interval[1]:.1f})"

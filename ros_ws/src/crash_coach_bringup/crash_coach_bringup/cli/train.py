@@ -1,0 +1,52 @@
+"""`crash-coach train`: one run, or several side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from policy_pkg.train.config import load_train_config
+
+from crash_coach_bringup.cli.jobs import Job, run_jobs
+from crash_coach_bringup.cli.output import CliError, console
+
+
+def plan_jobs(
+    configs: list[str], out: Path, overrides: list[str], seeds: list[int], resume: bool
+) -> list[Job]:
+    """One job per configuration and seed; ``out`` itself for one, folders below it for more."""
+    chosen: list[int | None] = [*seeds] if seeds else [None]
+    single = len(configs) == 1 and len(chosen) == 1
+    jobs: dict[Path, Job] = {}
+    for config_name in configs:
+        for seed in chosen:
+            config = load_train_config(config_name, overrides, seed)
+            name = f"{Path(config_name).stem}-s{config.seed}"
+            folder = out if single else out / name
+            if folder in jobs:
+                raise CliError(f"two runs would both be written to {folder}: name each run once")
+            jobs[folder] = Job(name, config, folder, resume)
+    return list(jobs.values())
+
+
+def train(
+    config: Annotated[
+        list[str],
+        typer.Argument(help="Configuration: a name such as buttons/qmix, or a YAML file."),
+    ],
+    out: Annotated[Path, typer.Option(help="Run directory; with several runs, their parent.")],
+    override: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="key=value ...: replaces settings, e.g. coach.beta=0.7"),
+    ] = None,
+    seed: Annotated[list[int] | None, typer.Option(help="Seed; several give several runs.")] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue from the newest checkpoint.")
+    ] = False,
+) -> None:
+    """Trains a team. Several configurations or seeds run side by side, a process per core."""
+    jobs = plan_jobs(config, out, override or [], seed or [], resume)
+    for job, summary in zip(jobs, run_jobs(jobs), strict=True):
+        console.print(f"{job.name}: {summary}")
+        console.print(f"  checkpoint: {job.out_dir}", soft_wrap=True)

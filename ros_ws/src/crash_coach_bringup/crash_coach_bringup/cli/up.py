@@ -1,0 +1,42 @@
+"""`crash-coach up`: a trained team as a running, supervised ROS graph."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+class Mode(StrEnum):
+    lockstep = "lockstep"
+    realtime = "realtime"
+
+
+def up(
+    scenario: Annotated[str, typer.Argument(help="Scenario name or YAML file.")],
+    policy: Annotated[Path, typer.Option(help="Run directory or checkpoint directory.")],
+    mode: Annotated[
+        Mode, typer.Option(help="As fast as every robot answers, or by the clock.")
+    ] = Mode.lockstep,
+    team_process: Annotated[
+        bool, typer.Option("--team-process", help="All policies in one process.")
+    ] = False,
+    episodes: Annotated[int, typer.Option(help="End after this many; 0: run on.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of episodes and crashes.", min=0)] = 0,
+    logs: Annotated[Path, typer.Option(help="Folder for the nodes' logs.")] = Path("runs/up"),
+) -> None:
+    """Starts sim, policies, gate and coach, one process each, until Ctrl-C or a node dies."""
+    from crash_coach_bringup.ros.supervisor import UpOptions, run_up
+
+    options = UpOptions(
+        scenario=scenario,
+        checkpoint=policy,
+        mode=mode.value,
+        team_process=team_process,
+        episodes=episodes,
+        seed=seed,
+        log_dir=logs,
+    )
+    raise typer.Exit(run_up(options))
