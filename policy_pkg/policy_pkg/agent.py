@@ -12,6 +12,7 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+
 from sim_pkg.contract import BoolArray, FloatArray, IntArray, UserError
 
 Stamp = TypeVar("Stamp")

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
+from types import FrameType
 
 import rclpy
 from crash_coach_interfaces.msg import Action, Observation
@@ -12,19 +15,21 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.context import Context
 from rclpy.exceptions import ParameterException
 from rclpy.experimental import EventsExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
-from sim_pkg.contract import UserError
 from std_msgs.msg import Header
 
 from policy_pkg.act import greedy
-from policy_pkg.agent import Agent
-from policy_pkg.checkpoint import load_policy
+from policy_pkg.agent import Agent, ObservationError
+from policy_pkg.checkpoint import CheckpointError, load_policy
 from policy_pkg.ros.convert import message_from_answer, sensed_from_message
+from sim_pkg.contract import UserError
 
 NEWEST = QoSProfile(depth=1)  # reliable: an observation or command replaces the one before
 SPIN_S = 0.1  # how soon a signal is noticed
+RCLError: type[Exception] = rclpy_implementation.RCLError  # bad --ros-args, for one
 
 
 class AgentNode(Node):
@@ -38,10 +43,10 @@ class AgentNode(Node):
         super().__init__(name, context=context)
         robot = self._text("robot", "robot that this policy drives") if one_robot else None
         checkpoint = self._text("checkpoint", "run directory or checkpoint directory")
-        command_topic = self._text(
-            "command_topic", "topic under /<robot>/ for the answers", "command_raw"
-        )
-        self._refuse_unknown_parameters()
+        command_topic = self._text("command_topic", "answers go to /<robot>/<this>", "command_raw")
+        self._check_parameters()
+        self.failure: UserError | None = None
+        """Why the node has to end; an exception in a callback would be told with a traceback."""
         bundle = load_policy(checkpoint)
         self.agent: Agent[Header] = Agent(
             bundle.policy,
@@ -64,32 +69,48 @@ class AgentNode(Node):
         value: str = self.declare_parameter(
             name, default, ParameterDescriptor(description=description, read_only=True)
         ).value
-        if not value:
-            raise UserError(f"parameter {name!r} of {self.get_name()} is missing: {description}")
         return value
 
-    def _refuse_unknown_parameters(self) -> None:
+    def _check_parameters(self) -> None:
+        known = ", ".join(sorted(self._parameters))
         for name in self._parameter_overrides:
             if not self.has_parameter(name):
-                known = ", ".join(sorted(self._parameters))
                 raise UserError(f"unknown parameter {name!r} of {self.get_name()}; known: {known}")
+        for name, parameter in self._parameters.items():
+            if parameter.value == "":
+                raise UserError(f"parameter {name!r} of {self.get_name()} is missing")
 
     def _on_observation(self, robot: int, message: Observation) -> None:
-        for answer in self.agent.receive(robot, sensed_from_message(message)):
+        try:
+            answers = self.agent.receive(robot, sensed_from_message(message))
+        except ObservationError as error:
+            self.failure = error
+            return
+        for answer in answers:
             self._commands[answer.robot].publish(message_from_answer(answer))
 
 
-def spin(make_node: Callable[[], Node]) -> int:
+def spin(make_node: Callable[[], AgentNode]) -> int:
     """Runs a node until SIGINT or SIGTERM; returns the exit code, 1 after one line of error."""
-    rclpy.init(signal_handler_options=SignalHandlerOptions.ALL)
+    received: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, note)
     try:
-        node = make_node()
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         executor = EventsExecutor()
+        node = make_node()
         executor.add_node(node)
-        while rclpy.ok():
+        while not received:
             executor.spin_once(timeout_sec=SPIN_S)
-    except (UserError, ParameterException) as error:
-        print(f"{sys.argv[0].rpartition('/')[2]}: error: {error}", file=sys.stderr)  # noqa: T201
+            if node.failure is not None:
+                raise node.failure
+    except (UserError, CheckpointError, ParameterException, RCLError) as error:
+        program = Path(sys.argv[0]).name
+        print(f"{program}: error: {error}", file=sys.stderr)  # noqa: T201
         return 1
     finally:
         rclpy.try_shutdown()

@@ -10,12 +10,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from crash_coach_bringup.ros.probe import find_executable
 from crash_coach_pkg.config import CoachConfig
 from policy_pkg.checkpoint import load_policy
 from sim_pkg.contract import UserError
 from sim_pkg.env import make_env
-
-from crash_coach_bringup.ros.probe import find_executable
 
 Mode = Literal["lockstep", "realtime"]
 Layout = Literal["nodes", "team", "single"]
@@ -105,36 +104,27 @@ def check_team(options: UpOptions) -> tuple[str, ...]:
     """Loads scenario and checkpoint and returns the robots' names.
 
     Raises:
-        GraphError: a checkpoint of another team than the scenario's.
         sim_pkg.config.ConfigError: no such scenario.
-        policy_pkg.checkpoint.CheckpointError: not a usable checkpoint.
+        policy_pkg.checkpoint.CheckpointError: no usable checkpoint, or one of another team.
     """
     spec = make_env(options.scenario, 1).spec
-    bundle = load_policy(options.checkpoint)
-    for what, has, needs in (
-        ("robots", len(bundle.robots), spec.n_robots),
-        ("observation features", bundle.obs_size, spec.obs_size),
-        ("actions", bundle.n_actions, spec.n_actions),
-    ):
-        if has != needs:
-            raise GraphError(
-                f"checkpoint {options.checkpoint} was trained on {bundle.scenario!r} for "
-                f"{has} {what}; scenario {options.scenario!r} has {needs}"
-            )
+    load_policy(options.checkpoint).check_spec(spec)
     return spec.robots
 
 
 def graph_nodes(options: UpOptions, robots: Sequence[str]) -> list[Node]:
     """The graph's nodes, the sim last: the others are ready to answer when it starts."""
-    checkpoint = str(options.checkpoint.resolve())
     acting: dict[str, Value] = {
-        "checkpoint": checkpoint,
+        "checkpoint": str(options.checkpoint.resolve()),
         "command_topic": "command_raw" if options.gate else "command",
     }
     nodes: list[Node] = []
     if options.gate:
         coach = coach_parameters(options.coach, robots, options.seed)
-        gate = {"robots": list(robots), "lockstep": options.mode == "lockstep"}
+        gate: dict[str, Value] = {
+            "robots": list(robots),
+            "lockstep": options.mode == "lockstep",
+        }
         nodes += [
             Node("gate", "crash_coach_pkg", "gate", gate),
             Node("coach", "crash_coach_pkg", "coach", coach),

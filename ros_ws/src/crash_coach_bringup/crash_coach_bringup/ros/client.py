@@ -1,0 +1,60 @@
+"""A short-lived node that talks to a running graph; every wait is bounded and says its aim."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rclpy.context import Context
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+from rclpy.task import Future
+
+from sim_pkg.contract import UserError
+
+SPIN_S = 0.05
+
+
+class WaitError(UserError):
+    """What was waited for did not come in time."""
+
+
+class GraphClient:
+    """A node with its own context and executor; ``check`` raises when waiting became useless."""
+
+    def __init__(self, node: Node, context: Context, check: Callable[[], None]) -> None:
+        self.node = node
+        self._check = check
+        self._executor = EventsExecutor(context=context)
+        self._executor.add_node(node)
+
+    def until(self, ready: Callable[[], bool], timeout_s: float, what: str) -> None:
+        """Serves the node's callbacks until ``ready()``. Raises WaitError naming ``what``."""
+        deadline = time.monotonic() + timeout_s
+        while not ready():
+            self._check()
+            left_s = deadline - time.monotonic()
+            if left_s <= 0:
+                raise WaitError(f"waited {timeout_s:g} s for {what}")
+            self._executor.spin_once(timeout_sec=min(SPIN_S, left_s))
+
+    def result(self, future: Future, timeout_s: float, what: str) -> Any:
+        """The result of a service call. Raises WaitError naming ``what``."""
+        self.until(future.done, timeout_s, what)
+        return future.result()
+
+
+@contextmanager
+def graph_client(
+    name: str, domain: int | None = None, check: Callable[[], None] = lambda: None
+) -> Iterator[GraphClient]:
+    """A client on ``domain`` (None: the environment's), independent of rclpy's global state."""
+    context = Context()
+    context.init(args=[], domain_id=domain)
+    try:
+        node = Node(name, context=context, use_global_arguments=False)
+        yield GraphClient(node, context, check)
+    finally:
+        context.try_shutdown()

@@ -1,0 +1,105 @@
+"""Crashes robots of a running graph through the coach's parameters, as ``ros2 param set`` does."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from std_srvs.srv import Trigger
+
+from crash_coach_bringup.ros.client import GraphClient, graph_client
+from sim_pkg.contract import UserError
+
+COACH = "/coach"
+
+
+class InjectError(UserError):
+    """The coach refused; the text is its reason."""
+
+
+@dataclass(frozen=True)
+class InjectResult:
+    """What the coach accepted, and its answer."""
+
+    victims: tuple[str, ...]
+    mode: str
+    apply_at: str
+    start_step: int
+    duration_steps: int
+    answer: str
+
+    def __str__(self) -> str:
+        return f"{', '.join(self.victims)}: {self.mode} from the {self.apply_at.replace('_', ' ')}"
+
+
+def inject(
+    victims: Sequence[str],
+    mode: str,
+    apply_at: str = "next_step",
+    duration_steps: int = 0,
+    start_step: int = 0,
+    timeout_s: float = 10.0,
+    domain: int | None = None,
+) -> InjectResult:
+    """Makes ``victims`` crash, all or none; returns once the gate has armed the fault.
+
+    Args:
+        victims: names of robots.
+        mode: mute, stay or random.
+        apply_at: next_step or next_episode.
+        duration_steps: control steps; 0: until the episode ends.
+        start_step: first faulted step of each episode, for next_episode.
+        timeout_s: longest wait for the coach to appear, and again for its answer.
+        domain: ROS domain; None: the environment's.
+
+    Raises:
+        InjectError: the coach refused, with its reason.
+        WaitError: no coach on this domain, or no answer.
+    """
+    wanted = {
+        "enabled": True,
+        "strategy": "fixed",
+        "victims": list(victims),
+        "crash_mode": mode,
+        "apply_at": apply_at,
+        "start_step": start_step,
+        "duration_steps": duration_steps,
+    }
+    parameters = [Parameter(name, value=value) for name, value in wanted.items()]
+    with graph_client("crash_coach_inject", domain) as client:
+        setter = AsyncParameterClient(client.node, COACH)
+        client.until(setter.services_are_ready, timeout_s, _no_coach(domain))
+        future = setter.set_parameters_atomically(parameters)
+        result = client.result(future, timeout_s, "the coach's answer").result
+    if not result.successful:
+        raise InjectError(f"the coach refused: {result.reason}")
+    return InjectResult(tuple(victims), mode, apply_at, start_step, duration_steps, result.reason)
+
+
+def clear(timeout_s: float = 10.0, domain: int | None = None) -> str:
+    """Ends every fault, from the next step on; returns the coach's answer.
+
+    Raises:
+        InjectError: the coach refused, with its reason.
+        WaitError: no coach on this domain, or no answer.
+    """
+    with graph_client("crash_coach_clear", domain) as client:
+        return _clear(client, timeout_s, domain)
+
+
+def _clear(client: GraphClient, timeout_s: float, domain: int | None) -> str:
+    service = client.node.create_client(Trigger, f"{COACH}/clear_all")
+    client.until(service.service_is_ready, timeout_s, _no_coach(domain))
+    future = service.call_async(Trigger.Request())
+    answer = client.result(future, timeout_s, "the coach's answer")
+    if not answer.success:
+        raise InjectError(f"the coach refused: {answer.message}")
+    return str(answer.message)
+
+
+def _no_coach(domain: int | None) -> str:
+    shown = os.environ.get("ROS_DOMAIN_ID", "0") if domain is None else domain
+    return f"a node {COACH} on ROS domain {shown}; start one with 'crash-coach up'"
