@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+
 from sim_pkg.contract import BoolArray, FloatArray, IntArray
 
 
 def greedy(q: FloatArray, available: BoolArray) -> IntArray:
     """(..., A) values and availability -> (...) the best available action, the first of equals."""
     masked = np.where(available, q, np.float32(-np.inf))
-    return masked.argmax(axis=-1).astype(np.int32)
+    best: IntArray = masked.argmax(axis=-1).astype(np.int32)
+    return best
 
 
 def epsilon_greedy(

@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -20,9 +20,9 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, ValidationError
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
-from sim_pkg.contract import EnvSpec, UserError
 
 from policy_pkg.policy import RecurrentPolicy
+from sim_pkg.contract import EnvSpec, UserError
 
 FORMAT = "crash-coach-checkpoint"
 VERSION = 1
@@ -55,8 +55,8 @@ class Manifest(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    format: Literal["crash-coach-checkpoint"] = FORMAT
-    version: Literal[1] = VERSION
+    format: Literal["crash-coach-checkpoint"] = "crash-coach-checkpoint"
+    version: Literal[1] = 1
     scenario: str
     robots: tuple[str, ...]
     n_actions: int
@@ -112,9 +112,12 @@ def write_checkpoint(
     """
     partial = folder.with_name(folder.name + ".partial")
     try:
-        partial.mkdir(parents=True)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        _remove(folder.parent.glob("*.partial"))  # what a killed process left
+        partial.mkdir()
         files = {stem: _write_tensors(partial, stem, arrays) for stem, arrays in tensors.items()}
-        text = manifest.model_copy(update={"files": files}).model_dump_json(indent=1)
+        complete = manifest.model_copy(update={"files": files}).model_dump()
+        text = json.dumps(complete, indent=1, allow_nan=False)
         _write_synced(partial / MANIFEST, (text + "\n").encode())
         _sync_folder(partial)
         partial.rename(folder)
@@ -124,8 +127,12 @@ def write_checkpoint(
         if isinstance(error, OSError):
             raise
         raise OSError(f"{partial}: {error}") from error
-    for old in list_checkpoints(folder.parent)[:-keep_last]:
-        shutil.rmtree(old)
+    _remove(list_checkpoints(folder.parent)[:-keep_last])
+
+
+def _remove(folders: Iterable[Path]) -> None:
+    for folder in folders:
+        shutil.rmtree(folder)
 
 
 def _write_tensors(folder: Path, stem: str, arrays: Tensors) -> TensorFile:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+
 from sim_pkg.contract import FloatArray, IntArray
 
 ROW_MULTIPLE = 8

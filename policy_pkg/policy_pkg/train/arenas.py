@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+
 from crash_coach_pkg.gate import apply_faults
 from crash_coach_pkg.plan import CrashPlan
+from policy_pkg.policy import RecurrentPolicy
 from sim_pkg.contract import (
     BatchEnv,
     EpisodeArray,
@@ -17,8 +19,6 @@ from sim_pkg.contract import (
     StepResult,
     stay_action,
 )
-
-from policy_pkg.policy import RecurrentPolicy
 
 ArenaArray = npt.NDArray[np.intp]
 ModeArray = npt.NDArray[np.uint8]

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any, Self
 
 import yaml
-from crash_coach_pkg.config import CoachConfig
 from pydantic import BaseModel, ConfigDict, Field, model_validator
-from sim_pkg.config import ConfigError, YamlTree, did_you_mean, load_tree, validate
 
+from crash_coach_pkg.config import CoachConfig
 from policy_pkg.train.learner_config import LearnerConfig
+from sim_pkg.config import ConfigError, YamlTree, did_you_mean, load_tree, validate
 
 CONFIGS_DIR = Path(__file__).parent.parent / "configs"
 
@@ -51,8 +51,8 @@ class TrainConfig(BaseModel):
         True, description="save the replay: without it, resuming starts with an empty one"
     )
     tensorboard: bool = Field(True, description="write the metrics for TensorBoard as well")
-    learner: LearnerConfig = Field(default_factory=LearnerConfig)  # type: ignore[arg-type]
-    coach: CoachConfig = Field(default_factory=CoachConfig)  # type: ignore[arg-type]
+    learner: LearnerConfig = LearnerConfig.model_validate({})
+    coach: CoachConfig = CoachConfig()
 
     @model_validator(mode="after")
     def _batch_fits_replay(self) -> Self:

@@ -9,18 +9,18 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
 from crash_coach_pkg.coach import Coach
 from crash_coach_pkg.config import CoachConfig
 from crash_coach_pkg.plan import CrashPlan
-from sim_pkg.contract import BatchEnv, UserError
-from sim_pkg.env import make_env
-from sim_pkg.trajectory import TrajectoryHash, combine
-
 from policy_pkg.act import greedy
 from policy_pkg.checkpoint import PolicyBundle
 from policy_pkg.policy import RecurrentPolicy
 from policy_pkg.train.arenas import ArenaArray, Arenas, Executed
 from policy_pkg.train.statistics import wilson
+from sim_pkg.contract import BatchEnv, UserError
+from sim_pkg.env import make_env
+from sim_pkg.trajectory import TrajectoryHash, combine
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from crash_coach_pkg.plan import CrashPlan, Fault, Mode
-from sim_pkg.contract import BatchEnv, StepResult
 
+from crash_coach_pkg.plan import CrashPlan, Fault, Mode
 from policy_pkg.act import epsilon_greedy
 from policy_pkg.checkpoint import CheckpointError
 from policy_pkg.policy import RecurrentPolicy
 from policy_pkg.train.arenas import ArenaArray, Arenas, ModeArray
 from policy_pkg.train.episode import Episode
+from sim_pkg.contract import BatchEnv, StepResult
 
 Array = npt.NDArray[Any]
 

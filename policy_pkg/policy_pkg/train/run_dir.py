@@ -1,0 +1,153 @@
+"""A run's directory: what it holds, and that nobody else writes to it.
+
+::
+
+    run.json          config, seed, versions, commit, command line: all it takes to repeat the run
+    metrics.jsonl     one line per evaluation block (see metrics)
+    timing.jsonl      the clock's figures of the same blocks
+    checkpoints/step_000100000/
+    tensorboard/
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from policy_pkg.checkpoint import CHECKPOINTS
+from policy_pkg.train.config import TrainConfig
+from sim_pkg.contract import UserError
+
+RUN = "run.json"
+METRICS = "metrics.jsonl"
+TIMING = "timing.jsonl"
+TENSORBOARD = "tensorboard"
+FORMAT = "crash-coach-run"
+LIBRARIES = ("numpy", "torch", "pymunk", "numba")
+
+
+class RunError(UserError):
+    """A run directory that cannot be used as asked."""
+
+
+def prepare_run(out_dir: Path, config: TrainConfig, resume: bool) -> None:
+    """Makes ``out_dir`` a run of ``config``, or checks that it is one already.
+
+    Raises:
+        RunError: it holds a run and ``resume`` is off; there is nothing to resume; the run has
+            another config (the text names the first key that differs); or it holds other things.
+    """
+    described = out_dir / RUN
+    if resume:
+        _check_same(read_run(out_dir), config, described)
+        return
+    if described.exists():
+        raise RunError(f"{out_dir} already holds a run: resume it, or choose another directory")
+    # A .partial file is what a killed process leaves.
+    if out_dir.is_dir() and any(p.suffix != ".partial" for p in out_dir.iterdir()):
+        raise RunError(f"{out_dir} is not empty and holds no run: choose another directory")
+    if out_dir.exists() and not out_dir.is_dir():
+        raise RunError(f"{out_dir} is a file: choose another directory")
+    out_dir.mkdir(parents=True, exist_ok=True)
+    partial = described.with_name(RUN + ".partial")
+    partial.write_text(json.dumps(describe_run(config), indent=1) + "\n", encoding="utf-8")
+    partial.rename(described)
+
+
+def read_run(out_dir: Path) -> dict[str, Any]:
+    """The content of ``run.json``.
+
+    Raises:
+        RunError: there is none, or it is not one of ours.
+    """
+    path = out_dir / RUN
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise RunError(f"{out_dir} holds no run to resume: {RUN} is missing") from None
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise RunError(f"{path} cannot be read: {error}") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise RunError(f'{path} does not describe a run: no "format": "{FORMAT}"')
+    return content
+
+
+def describe_run(config: TrainConfig) -> dict[str, Any]:
+    """What it takes to repeat the run. ``commit`` is null outside a git checkout."""
+    return {
+        "format": FORMAT,
+        "version": 1,
+        "config": config.model_dump(mode="json"),
+        "seed": config.seed,
+        "versions": {
+            "python": platform.python_version(),
+            **{name: version(name) for name in LIBRARIES},
+        },
+        "machine": platform.machine(),
+        "commit": _commit(),
+        "command": sys.argv,
+    }
+
+
+def _commit() -> str | None:
+    """HEAD of the checkout this file lies in, with "+changes" where files differ from it."""
+    folder = Path(__file__).resolve().parent
+    command = ["git", "-C", str(folder), "describe", "--always", "--abbrev=40", "--dirty=+changes"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() or None
+
+
+def _check_same(run: dict[str, Any], config: TrainConfig, path: Path) -> None:
+    before = _flat(run.get("config", {}))
+    now = _flat(config.model_dump(mode="json"))
+    for key in sorted({*before, *now}):
+        old, new = before.get(key, "nothing"), now.get(key, "nothing")
+        if old != new:
+            raise RunError(
+                f"{path.parent} was started with {key} = {old!r}, not {new!r}: "
+                "a run is resumed with the config it was started with"
+            )
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, dict):
+            flat.update(_flat(value, f"{prefix}{key}."))
+        else:
+            flat[prefix + key] = value
+    return flat
+
+
+def checkpoint_path(out_dir: Path, env_steps: int) -> Path:
+    return out_dir / CHECKPOINTS / f"step_{env_steps:09d}"
+
+
+@contextmanager
+def locked(out_dir: Path) -> Iterator[None]:
+    """Keeps other processes from training in ``out_dir``; ends with the process at the latest.
+
+    Raises:
+        RunError: another process holds it.
+    """
+    descriptor = os.open(out_dir / RUN, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RunError(f"{out_dir} is being trained by another process") from None
+        yield
+    finally:
+        os.close(descriptor)

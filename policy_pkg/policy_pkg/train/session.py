@@ -1,0 +1,229 @@
+"""All of a training run that changes while it runs, and the evaluation beside it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from crash_coach_pkg.coach import Coach
+from crash_coach_pkg.strategies import Progress
+from policy_pkg.policy import RecurrentPolicy
+from policy_pkg.train.config import TrainConfig
+from policy_pkg.train.episode import Sizes
+from policy_pkg.train.evaluate import Condition, Evaluation, crash_free, evaluate_in
+from policy_pkg.train.learner import Learner
+from policy_pkg.train.metrics import Means, Value
+from policy_pkg.train.replay import Replay
+from policy_pkg.train.rollout import Finished, Rollout
+from sim_pkg.contract import BatchEnv, UserError
+
+TEST_ARENAS = 32
+_TEST_KEY = 0x7E57
+_EXPLORATION, _SAMPLING = 1, 2  # streams of the run's seed
+
+TRAIN_MEANS = ("train_success_rate", "train_return_mean", "train_steps_mean")
+LEARNER_MEANS = ("loss", "grad_norm", "td_error_abs", "q_taken_mean", "target_mean")
+
+
+@dataclass
+class Counters:
+    """Where a run stands. ``credit`` is the gradient steps owed, below 1 between steps."""
+
+    env_steps: int = 0
+    episodes: int = 0
+    blocks: int = 0
+    next_block_steps: int = 0
+    credit: float = 0.0
+
+    def to_json(self) -> dict[str, int | float]:
+        return asdict(self)
+
+
+def generator(seed: int, stream: int) -> np.random.Generator:
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, stream])))
+
+
+@dataclass(frozen=True)
+class Block:
+    """The greedy episodes of one evaluation block."""
+
+    crashed: Evaluation  # crashes drawn at the coach's rate
+    crash_free: Evaluation | None  # the same episodes without crashes
+
+
+@dataclass
+class Session:
+    """Collects, learns and tests; knows nothing of files and clocks.
+
+    Args:
+        config: of the run.
+        env: for training; its arenas are this session's alone.
+        test_env: for evaluation blocks.
+
+    Raises:
+        UserError: the coach's settings do not fit the scenario.
+    """
+
+    config: TrainConfig
+    env: BatchEnv
+    test_env: BatchEnv
+    counters: Counters = field(default_factory=Counters)
+    means: Means = field(default_factory=Means)
+
+    def __post_init__(self) -> None:
+        config, spec = self.config, self.env.spec
+        try:
+            self.coach = Coach(config.coach, spec.robots, config.seed)
+        except ValueError as error:
+            raise UserError(f"coach of scenario {spec.scenario!r}: {error}") from error
+        if self.coach.needs_success and not spec.reports_success:
+            raise UserError(
+                f"scenario {spec.scenario!r} reports no success, which coach.strategy = "
+                f"{config.coach.strategy!r} needs; use none, fixed or curriculum"
+            )
+        sizes = Sizes.of(spec)
+        self.learner = Learner(config.learner, sizes, config.seed)
+        self.policy = RecurrentPolicy(self.learner.agent_weights(), spec.n_robots, spec.n_actions)
+        self.replay = Replay(config.replay_episodes, sizes)
+        self.sampling = generator(config.seed, _SAMPLING)
+        exploration = generator(config.seed, _EXPLORATION)
+        self.rollout = Rollout(self.env, self.policy, self.coach.plan, config.seed, exploration)
+
+    @property
+    def progress(self) -> Progress:
+        done = self.counters
+        return Progress(done.env_steps, self.config.total_steps, done.episodes)
+
+    @property
+    def finished(self) -> bool:
+        return self.counters.env_steps >= self.config.total_steps
+
+    @property
+    def block_due(self) -> bool:
+        """At step 0, whenever a multiple of the interval is passed, and at the end."""
+        done = self.counters
+        return done.env_steps >= min(done.next_block_steps, self.config.total_steps)
+
+    def collect(self) -> None:
+        """One step in every arena; learns after each episode that it ended, as PyMARL does.
+
+        Raises:
+            DivergedError: from the learner.
+        """
+        done = self.counters
+        updates = self.learner.updates
+        finished = self.rollout.step(self.config.epsilon(done.env_steps))
+        done.env_steps += self.rollout.n_arenas
+        for episode in finished:
+            self._take(episode)
+            self._learn()
+        if self.learner.updates != updates:
+            self.policy.set_weights(self.learner.agent_weights())
+
+    def _take(self, finished: Finished) -> None:
+        self.replay.add(finished.episode)
+        self.counters.episodes += 1
+        self.coach.count(finished.plan)
+        self.coach.advance(self.progress)
+        results = (
+            float(finished.success),
+            float(finished.episode.reward.sum(dtype=np.float64)),
+            float(finished.episode.length),
+        )
+        self.means.add(dict(zip(TRAIN_MEANS, results, strict=True)))
+
+    def _learn(self) -> None:
+        if len(self.replay) < self.config.batch_episodes:
+            return
+        self.counters.credit += self.config.updates_per_episode
+        while self.counters.credit >= 1:
+            self.counters.credit -= 1
+            batch = self.replay.sample(self.sampling, self.config.batch_episodes)
+            self.means.add(self.learner.update(batch, episodes=self.counters.episodes))
+
+    def test(self) -> Block:
+        """Plays the block's episodes greedily; each block has episodes of its own."""
+        count = self.config.test_episodes
+        episodes = range(self.counters.blocks * count, (self.counters.blocks + 1) * count)
+        crash = self.config.coach
+        if crash.strategy != "none":
+            at_rate = {"strategy": "fixed", "crash_rate": self.coach.rate}
+            crash = crash.model_copy(update=at_rate)
+        block = self._play(Condition("block", crash), episodes)
+        if not self.config.test_crash_free:
+            return Block(block, None)
+        if not any(episode.crashed for episode in block.episodes):
+            return Block(block, block)  # the same seeds: the same episodes
+        return Block(block, self._play(crash_free(), episodes))
+
+    def _play(self, condition: Condition, episodes: range) -> Evaluation:
+        seed = self.config.seed ^ _TEST_KEY
+        return evaluate_in(self.test_env, self.policy, condition, episodes, seed)
+
+    def end_block(self, block: Block) -> dict[str, Value]:
+        """Tells the coach e_t; returns the block's line of metrics."""
+        done, spec = self.counters, self.env.spec
+        record = self.coach.record_block(block.crashed.success_rate, self.progress)
+        interval = self.config.test_interval_steps
+        done.blocks += 1
+        done.next_block_steps = (done.env_steps // interval + 1) * interval
+        means = self.means.take(TRAIN_MEANS + LEARNER_MEANS)
+        if not spec.reports_success:
+            means["train_success_rate"] = None
+        summary = block.crashed.summary()
+        free = block.crash_free
+        return {
+            "env_steps": done.env_steps,
+            "episodes": done.episodes,
+            "gradient_steps": self.learner.updates,
+            "epsilon": self.config.epsilon(done.env_steps),
+            "alpha": record.rate,
+            "cap": record.cap,
+            "crashed_fraction": record.crashed_fraction,
+            "success_rate": record.success_rate if spec.reports_success else None,
+            "return_mean": summary["return_mean"],
+            "steps_mean": summary["steps_mean"],
+            "block_crashed": summary["crashed_fraction"],
+            "decision": record.decision,
+            "new_alpha": record.new_rate,
+            "success_crash_free": free.success_rate if free and spec.reports_success else None,
+            "return_crash_free": free.return_mean if free else None,
+            **means,
+            "updates_per_episode": self.config.updates_per_episode,
+        }
+
+    def state_dict(self) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
+        """Tensor files by stem, and JSON values."""
+        learner, learner_values = self.learner.state_dict()
+        rollout, rollout_values = self.rollout.state_dict()
+        tensors = {"agent": self.learner.agent_weights(), "learner": learner, "rollout": rollout}
+        if self.config.checkpoint_replay:
+            tensors["replay"] = self.replay.state_dict()
+        values = {
+            "coach": self.coach.state_dict(),
+            "learner": learner_values,
+            "rollout": rollout_values,
+            "sampling": dict(self.sampling.bit_generator.state),
+            "means": self.means.state_dict(),
+        }
+        return tensors, values
+
+    def load_state_dict(
+        self, tensors: dict[str, dict[str, Any]], values: dict[str, Any], counters: Counters
+    ) -> None:
+        """Continues from what ``state_dict`` gave; only for a session not yet used.
+
+        Raises:
+            ValueError, KeyError: it is of something else, or incomplete.
+        """
+        self.learner.load_state_dict(tensors["learner"], values["learner"])
+        self.policy.set_weights(self.learner.agent_weights())
+        self.rollout.load_state_dict(tensors["rollout"], values["rollout"])
+        if self.config.checkpoint_replay:
+            self.replay.load_state_dict(tensors["replay"])
+        self.coach.load_state_dict(values["coach"])
+        self.sampling.bit_generator.state = values["sampling"]
+        self.means.load_state_dict(values["means"])
+        self.counters = counters

@@ -1,0 +1,71 @@
+"""A session to a checkpoint and back, bit for bit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from policy_pkg.checkpoint import (
+    CheckpointError,
+    Manifest,
+    read_manifest,
+    read_tensors,
+    write_checkpoint,
+)
+from policy_pkg.train.metrics import Value
+from policy_pkg.train.run_dir import checkpoint_path
+from policy_pkg.train.session import Counters, Session
+
+KEEP_LAST = 2
+
+
+@dataclass(frozen=True)
+class Logged:
+    """What the run's log files held when the checkpoint was written."""
+
+    metrics_bytes: int = 0
+    timing_bytes: int = 0
+    last_block: dict[str, Value] | None = None
+
+
+def save(out_dir: Path, session: Session, logged: Logged) -> Path:
+    """Writes a checkpoint of ``session`` and removes all but the newest ones.
+
+    Raises:
+        OSError: it could not be written; the older ones are untouched.
+    """
+    spec, done = session.env.spec, session.counters
+    tensors, values = session.state_dict()
+    manifest = Manifest(
+        scenario=session.config.scenario,
+        robots=spec.robots,
+        n_actions=spec.n_actions,
+        obs_size=spec.obs_size,
+        config=session.config.model_dump(mode="json"),
+        progress=done.to_json(),
+        training={**values, "logged": vars(logged)},
+    )
+    folder = checkpoint_path(out_dir, done.env_steps)
+    write_checkpoint(folder, manifest, tensors, KEEP_LAST)
+    return folder
+
+
+def restore(folder: Path, session: Session) -> Logged:
+    """Continues from the checkpoint in ``folder``; only for a session not yet used.
+
+    Raises:
+        CheckpointError: names the file and what is wrong with it.
+    """
+    manifest = read_manifest(folder)
+    stems = ["learner", "rollout"] + (["replay"] if session.config.checkpoint_replay else [])
+    tensors = {stem: read_tensors(folder, manifest, stem) for stem in stems}
+    values: dict[str, Any] = manifest.training
+    try:
+        counters = Counters(**manifest.progress)  # type: ignore[arg-type]
+        session.load_state_dict(tensors, values, counters)
+        return Logged(**values["logged"])
+    except CheckpointError as error:
+        raise CheckpointError(f"{folder}: {error}") from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"{folder} does not fit this run: {error}") from error
