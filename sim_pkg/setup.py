@@ -5,7 +5,7 @@ package = "sim_pkg"
 setup(
     name=package,
     version="0.1.0",
-    description="Multi-robot simulator on pymunk, as a library, a PettingZoo environment and a ROS 2 node.",
+    description="Multi-robot simulator on pymunk: library, PettingZoo environment, ROS 2 node.",
     maintainer="Crash Coach engineers",
     maintainer_email="team@crash-coach.dev",
     license="Apache-2.0",

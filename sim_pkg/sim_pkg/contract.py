@@ -120,4 +120,5 @@ class BatchEnv(Protocol):
 def stay_action(available: BoolArray, stay_actions: tuple[int, ...]) -> IntArray:
     """(..., A) availability -> (...) the preferred no-move action that is available."""
     stays = np.asarray(stay_actions, dtype=np.int32)
-    return stays[np.argmax(available[..., stays], axis=-1)]
+    stay: IntArray = stays[np.argmax(available[..., stays], axis=-1)]
+    return stay

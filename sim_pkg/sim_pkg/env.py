@@ -99,8 +99,8 @@ class Env:
         return self._out.available
 
     @property
-    def positions_m(self) -> Float64Array:
-        return self._positions_m
+    def positions_m(self) -> FloatArray:
+        return self._positions_m.astype(np.float32)
 
     @property
     def velocities_mps(self) -> Float64Array:
@@ -172,7 +172,7 @@ class Env:
             )
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _first_unavailable(running, actions, available):  # type: ignore[no-untyped-def]
     """Flat (arena, robot) index of the first action that is not allowed, or -1."""
     n_actions = available.shape[2]

@@ -177,10 +177,8 @@ class Buttons:
         )
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _command(
-    running, actions, moves, cells, rows, cell_m, dt_s, max_speed_mps, bodies, commands
-):  # type: ignore[no-untyped-def]
+@njit(cache=True)
+def _command(running, actions, moves, cells, rows, cell_m, dt_s, max_speed_mps, bodies, commands):  # type: ignore[no-untyped-def]
     """Velocity that takes each robot from where it is to the centre of the cell it was told.
 
     Starting from the true position, not from the cell's centre, errors cannot add up.
@@ -202,7 +200,7 @@ def _command(
             commands[b, i, 1] = vy
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _read_cells(running, bodies, rows, columns, cell_m, cells):  # type: ignore[no-untyped-def]
     """The cell in which each robot's centre lies, from the physics."""
     for b in range(cells.shape[0]):
@@ -215,10 +213,8 @@ def _read_cells(running, bodies, rows, columns, cell_m, cells):  # type: ignore[
             cells[b, i, 1] = min(max(column, 0), columns - 1)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _score(
-    running, cells, buttons, touched, steps, limit, rewards, reward, terminated, success
-):  # type: ignore[no-untyped-def]
+@njit(cache=True)
+def _score(running, cells, buttons, touched, steps, limit, rewards, reward, terminated, success):  # type: ignore[no-untyped-def]
     for b in range(cells.shape[0]):
         reward[b] = 0.0
         terminated[b] = False
@@ -240,7 +236,7 @@ def _score(
         terminated[b] = done or steps[b] >= limit
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _observe(running, cells, buttons, scale, obs, state):  # type: ignore[no-untyped-def]
     n, m = cells.shape[1], buttons.shape[0]
     for b in range(cells.shape[0]):

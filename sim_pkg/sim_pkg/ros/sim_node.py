@@ -1,0 +1,286 @@
+"""The sim node: a Session behind ROS topics and services, in lock-step or in real time."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from enum import Enum
+
+import rclpy
+from crash_coach_interfaces.msg import Action, FaultEvent
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.exceptions import InvalidParameterException
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from std_srvs.srv import SetBool, Trigger
+
+from sim_pkg.config import ConfigError
+from sim_pkg.env import make_env
+from sim_pkg.lockstep import Decisions
+from sim_pkg.realtime import NewestCommands
+from sim_pkg.ros import convert
+from sim_pkg.ros.sim_params import read_parameters
+from sim_pkg.ros.sim_topics import SimTopics
+from sim_pkg.session import Session
+
+# Long enough for participants on one machine to have found each other.
+_DISCOVERY_S = 1.0
+_POLL_S = 0.05
+_HOUSEKEEPING_S = 1.0
+_SPIN_S = 0.1
+
+
+class _Phase(Enum):
+    MATCHING = "waiting for the robots' publishers and subscribers"
+    IDLE = "waiting for /sim/reset"
+    RUNNING = "running"
+    DONE = "done"
+
+
+class SimNode(Node):
+    """See ROS.md and docs/ros.md for the protocol. ``done`` or ``failure`` end the process.
+
+    Raises:
+        ConfigError: a parameter or the scenario is wrong.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("sim")
+        self.failure: str | None = None
+        self._params = params = read_parameters(self)
+        self._env = env = make_env(params.scenario, 1)
+        self._session = Session(env, params.seed, params.first_episode)
+        self._lockstep = params.mode == "lockstep"
+        self._decisions = Decisions(env.spec.robots)
+        self._newest = NewestCommands(
+            env.spec.robots, params.cmd_timeout_s or 3 * env.spec.dt_s / params.real_time_factor
+        )
+        self._phase = _Phase.MATCHING
+        self._paused = False
+        self._step_permits = 0
+        self._robot_indexes = {name: i for i, name in enumerate(env.spec.robots)}
+        self._topics = SimTopics(self, env.spec, params.seed, self._on_command, self._on_event)
+        self.create_service(Trigger, "/sim/reset", self._on_reset)
+        self.create_service(Trigger, "/sim/step", self._on_step)
+        self.create_service(SetBool, "/sim/pause", self._on_pause)
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._born_s = self._sent_s = time.monotonic()
+        self._match_timer = self._every(_POLL_S, self._poll_match)
+        self._every(_HOUSEKEEPING_S, self._housekeeping)
+        if self._lockstep:
+            self._every(params.resend_after_s / 2, self._resend)
+        else:
+            self._every(env.spec.dt_s / params.real_time_factor, self._tick)
+
+    @property
+    def done(self) -> bool:
+        """The wanted number of episodes has ended, or something failed."""
+        return self._phase is _Phase.DONE or self.failure is not None
+
+    def finish(self) -> None:
+        """Leaves no reader without the last episode state."""
+        self._topics.flush()
+
+    def _every(self, period_s: float, callback):  # type: ignore[no-untyped-def]
+        return self.create_timer(period_s, callback, clock=self._steady)
+
+    # --- start ------------------------------------------------------------------------------
+
+    def _poll_match(self) -> None:
+        """Starts once every robot is there and no other sim is; gives up in bounded time."""
+        waited_s = time.monotonic() - self._born_s
+        others = self._topics.other_sims()
+        if others:
+            self.failure = (
+                f"another sim is on this ROS domain: {', '.join(others)}; stop it or set another "
+                "ROS_DOMAIN_ID (one that was killed is still listed for about 20 s)"
+            )
+            return
+        missing = self._topics.unmatched()
+        if missing and waited_s > self._params.match_timeout_s:
+            text = f"after {self._params.match_timeout_s:g} s still: {'; '.join(missing)}"
+            if self._lockstep:
+                self.failure = text
+                return
+            self.get_logger().warning(f"{text}; starting without them")
+        elif missing or waited_s < _DISCOVERY_S:
+            return
+        self._match_timer.cancel()
+        self._topics.refresh_listeners()
+        self._phase = _Phase.IDLE
+        if self._params.autostart:
+            self._begin()
+
+    def _begin(self) -> None:
+        self._session.begin()
+        self._phase = _Phase.RUNNING
+        self._newest.open(self._session.episode)
+        self._open_step()
+
+    def _open_step(self) -> None:
+        """Awaits commands for the session's step, then says that it awaits them."""
+        session = self._session
+        if self._lockstep:
+            self._decisions.open(session.episode, session.step, session.stay(), session.available)
+        self._sent_s = time.monotonic()
+        self._topics.publish_step(session)
+
+    # --- stepping ---------------------------------------------------------------------------
+
+    def _on_command(self, robot: int, message: Action) -> None:
+        if not self._lockstep:
+            self._newest.command(
+                robot, message.episode, message.action, message.fault, time.monotonic()
+            )
+            return
+        try:
+            counts = self._decisions.command(
+                robot, message.episode, message.step, message.action, message.fault
+            )
+        except ValueError as error:
+            self._fail(str(error))
+            return
+        if counts:
+            self._advance_if_complete()
+
+    def _on_event(self, event: FaultEvent) -> None:
+        robot = self._robot_indexes.get(event.robot)
+        if robot is None or not convert.is_mute(event):
+            return
+        if not self._lockstep:
+            self._newest.mute(robot, event.episode, time.monotonic())
+        elif self._decisions.mute(robot, event.episode, event.step):
+            self._advance_if_complete()
+
+    def _advance_if_complete(self) -> None:
+        if self._decisions.complete and self._may_step():
+            self._advance(self._decisions)
+
+    def _tick(self) -> None:
+        """Real time: a control step is due."""
+        if self._phase is not _Phase.RUNNING or not self._may_step():
+            return
+        session = self._session
+        refused = self._newest.sample(session.stay(), session.available, time.monotonic())
+        for text in refused:
+            self.get_logger().warning(f"refused: {text}")
+        self._advance(self._newest)
+
+    def _may_step(self) -> bool:
+        """Not paused, or one step was granted (and is now used up)."""
+        if not self._paused:
+            return True
+        if self._step_permits == 0:
+            return False
+        self._step_permits -= 1
+        return True
+
+    def _advance(self, decided: Decisions | NewestCommands) -> None:
+        self._session.advance(decided.actions, decided.crashed)
+        if self._session.running:
+            self._open_step()
+        else:
+            self._close_episode()
+
+    def _close_episode(self) -> None:
+        """Publishes the end and starts what comes next."""
+        self._decisions.close()
+        self._topics.publish_step(self._session)
+        if self._session.begun == self._params.episodes:
+            self._phase = _Phase.DONE
+        elif self._params.autostart:
+            self._begin()
+        else:
+            self._phase = _Phase.IDLE
+
+    def _resend(self) -> None:
+        """Lock-step: an observation or its answer may have been lost."""
+        if time.monotonic() - self._sent_s < self._params.resend_after_s:
+            return
+        try:
+            silent = self._decisions.resend(self._params.max_resends)
+        except TimeoutError as error:
+            self._fail(str(error))
+            return
+        self._sent_s = time.monotonic()
+        self._topics.publish_observations(silent)
+
+    def _fail(self, text: str) -> None:
+        """Ends the episode loudly: readers see it cut short, the process exits with an error."""
+        self.failure = text
+        self._decisions.close()
+        if self._session.running:
+            self._session.cut()
+            self._topics.publish_step(self._session)
+
+    def _housekeeping(self) -> None:
+        self._topics.refresh_listeners()
+        decided = self._decisions if self._lockstep else self._newest
+        self._topics.publish_diagnostics(decided.health)
+
+    # --- services ---------------------------------------------------------------------------
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._phase in (_Phase.MATCHING, _Phase.DONE):
+            response.message = f"cannot reset: {self._phase.value}"
+            return response
+        self._step_permits = 0
+        if self._session.running:
+            self._session.cut()
+            self._close_episode()
+        if self._phase is _Phase.IDLE:
+            self._begin()
+        response.success = self._phase is _Phase.RUNNING
+        running = f"episode {self._session.episode} runs"
+        response.message = running if response.success else "that was the last episode"
+        return response
+
+    def _on_step(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if not self._paused or self._phase is not _Phase.RUNNING:
+            state = self._phase.value if self._phase is not _Phase.RUNNING else "not paused"
+            response.message = f"cannot step: {state}"
+            return response
+        response.success = True
+        response.message = f"step {self._session.step} of episode {self._session.episode}"
+        self._step_permits += 1
+        if self._lockstep:
+            self._advance_if_complete()
+        return response
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._paused = request.data
+        self._step_permits = 0
+        response.success = True
+        response.message = "paused" if request.data else "running on"
+        if not request.data and self._lockstep:
+            self._advance_if_complete()
+        return response
+
+
+def main() -> None:
+    """Entry point of ``ros2 run sim_pkg sim``; exit code 0 at the end or on a signal, else 1."""
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    stopped: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda n, _: stopped.append(n))
+    failure: str | None = None
+    try:
+        node = SimNode()
+        executor = EventsExecutor()
+        executor.add_node(node)
+        while not stopped and not node.done:
+            executor.spin_once(timeout_sec=_SPIN_S)
+        failure = node.failure
+        node.finish()
+        executor.remove_node(node)
+        node.destroy_node()
+    except (ConfigError, InvalidParameterException) as error:
+        failure = str(error)
+    finally:
+        rclpy.try_shutdown()
+    if failure is not None:
+        print(f"sim: error: {failure}", file=sys.stderr)  # noqa: T201
+        sys.exit(1)

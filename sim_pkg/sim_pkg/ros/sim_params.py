@@ -1,0 +1,68 @@
+"""The sim node's parameters: one strict model, declared from it and validated by it."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.node import Node
+
+from sim_pkg.config import ConfigError, StrictModel, did_you_mean
+
+_OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides")
+
+
+class SimParameters(StrictModel):
+    """Read once at start-up; the node's parameters are read-only afterwards."""
+
+    scenario: str = Field("buttons", description="name of a shipped scenario, or path of a YAML")
+    mode: Literal["lockstep", "realtime"] = Field(
+        "lockstep", description="lockstep: waits for every robot; realtime: a steady clock"
+    )
+    seed: int = Field(0, ge=0, le=2**63 - 1, description="episodes are keyed by (seed, episode)")
+    first_episode: int = Field(0, ge=0, le=2**31, description="number of the first episode")
+    episodes: int = Field(0, ge=0, le=2**31, description="exit after so many; 0: endless")
+    autostart: bool = Field(True, description="false: /sim/reset starts each episode")
+    resend_after_s: float = Field(
+        0.25, gt=0, le=60, description="lockstep: send an observation again after this silence"
+    )
+    max_resends: int = Field(
+        20, ge=0, le=100_000, description="lockstep: then the episode ends as an error"
+    )
+    match_timeout_s: float = Field(
+        30.0, gt=0, le=3600, description="longest wait for every robot's publisher and subscriber"
+    )
+    cmd_timeout_s: float = Field(
+        0.0, ge=0, le=3600, description="realtime: age at which a command is void; 0: 3 dt"
+    )
+    real_time_factor: float = Field(
+        1.0, gt=0, le=1000, description="realtime: simulated seconds per second"
+    )
+
+
+def read_parameters(node: Node) -> SimParameters:
+    """Declares the parameters on ``node`` and returns what was set on the command line.
+
+    Raises:
+        ConfigError: an unknown name, a wrong type, NaN, or a value out of range.
+    """
+    known = SimParameters.model_fields
+    for name in node._parameter_overrides:
+        if name not in known and name.split(".")[0] not in _OF_RCLPY:
+            raise ConfigError(
+                f"unknown parameter {name!r}{did_you_mean(name, known)}; known: {', '.join(known)}"
+            )
+    values: dict[str, Any] = {}
+    for name, field in known.items():
+        # Typed by the model below, which says more than a type mismatch in rclpy does.
+        about = ParameterDescriptor(
+            description=field.description, read_only=True, dynamic_typing=True
+        )
+        values[name] = node.declare_parameter(name, field.default, about).value
+    try:
+        return SimParameters.model_validate(values)
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]
+        name = ".".join(map(str, problem["loc"]))
+        raise ConfigError(f"parameter {name} = {problem['input']!r}: {problem['msg']}") from error

@@ -1,0 +1,132 @@
+"""The sim node's publishers and subscriptions, and whether anybody is at their other ends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from crash_coach_interfaces.msg import Action, EpisodeState, FaultEvent, Observation
+from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Odometry
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Header
+from visualization_msgs.msg import MarkerArray
+
+from sim_pkg.contract import EnvSpec
+from sim_pkg.lockstep import Health
+from sim_pkg.ros import convert
+from sim_pkg.session import Session
+
+EPISODE_TOPIC = "/sim/episode"
+EVENTS_TOPIC = "/coach/events"
+_ACK_TIMEOUT_S = 2.0
+
+
+def _reliable(depth: int) -> QoSProfile:
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE)
+
+
+class SimTopics:
+    """Everything that the sim sends and receives on topics."""
+
+    def __init__(
+        self,
+        node: Node,
+        spec: EnvSpec,
+        seed: int,
+        on_command: Callable[[int, Action], None],
+        on_event: Callable[[FaultEvent], None],
+    ) -> None:
+        self._node = node
+        self._spec = spec
+        self._period_ns = convert.step_period_ns(spec.dt_s)
+        self._header = Header(frame_id=convert.MAP_FRAME)
+        self._observations = convert.ObservationWriter(spec, self._header)
+        self._episode = convert.EpisodeWriter(spec, seed, self._header)
+        self._clock = Clock(clock=self._header.stamp)
+        latched = QoSProfile(
+            depth=10,
+            reliability=ReliabilityPolicy.RELIABLE,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL,
+        )
+        pub = node.create_publisher
+        self._episode_pub = pub(EpisodeState, EPISODE_TOPIC, latched)
+        self._clock_pub = pub(Clock, "/clock", _reliable(10))
+        self._markers_pub = pub(MarkerArray, "/sim/markers", _reliable(10))
+        self._diagnostics_pub = pub(DiagnosticArray, "/diagnostics", _reliable(10))
+        self._obs_pubs = [pub(Observation, f"/{r}/observation", _reliable(1)) for r in spec.robots]
+        self._odom_pubs = [pub(Odometry, f"/{r}/odom", _reliable(10)) for r in spec.robots]
+        self._command_subs = [
+            node.create_subscription(
+                Action, f"/{robot}/command", partial(on_command, i), _reliable(1)
+            )
+            for i, robot in enumerate(spec.robots)
+        ]
+        node.create_subscription(FaultEvent, EVENTS_TOPIC, on_event, _reliable(100))
+        self._draw = False
+        self._odom: list[int] = []
+
+    def refresh_listeners(self) -> None:
+        """Notes who listens to what is built on demand only (odometry, markers)."""
+        self._draw = self._markers_pub.get_subscription_count() > 0
+        self._odom = [
+            i for i, pub in enumerate(self._odom_pubs) if pub.get_subscription_count() > 0
+        ]
+
+    def unmatched(self) -> list[str]:
+        """Topics that nobody listens on (observations) or publishes (commands)."""
+        missing = []
+        for robot, pub, sub in zip(
+            self._spec.robots, self._obs_pubs, self._command_subs, strict=True
+        ):
+            if pub.get_subscription_count() == 0:
+                missing.append(f"/{robot}/observation has no subscriber")
+            if sub.get_publisher_count() == 0:
+                missing.append(f"/{robot}/command has no publisher")
+        return missing
+
+    def other_sims(self) -> list[str]:
+        """Full names of other nodes that publish the episode state on this domain."""
+        mine = self._node.get_fully_qualified_name()
+        infos = self._node.get_publishers_info_by_topic(EPISODE_TOPIC)
+        names = [f"{i.node_namespace.rstrip('/')}/{i.node_name}" for i in infos]
+        if mine in names:
+            names.remove(mine)
+        return names
+
+    def publish_step(self, session: Session) -> None:
+        """Everything about the situation before (or at the end, after) a control step."""
+        convert.set_time(self._header.stamp, session.global_step * self._period_ns)
+        self._clock_pub.publish(self._clock)
+        if session.running and session.step > 0:
+            # The policies work while the rest is published.
+            self._observations.fill(session)
+            self.publish_observations(range(self._spec.n_robots))
+            self._episode_pub.publish(self._episode.fill(session))
+        else:
+            # A new episode: its plan takes longest. An ended one: nothing to observe.
+            self._episode_pub.publish(self._episode.fill(session))
+            if session.running:
+                self._observations.fill(session)
+                self.publish_observations(range(self._spec.n_robots))
+        if self._draw:
+            self._markers_pub.publish(convert.markers(session, self._header))
+        for robot in self._odom:
+            self._odom_pubs[robot].publish(convert.odometry(session, self._header, robot))
+
+    def publish_observations(self, robots: range | list[int]) -> None:
+        """The current step's observations (once more) to some robots."""
+        for robot in robots:
+            self._obs_pubs[robot].publish(self._observations.messages[robot])
+
+    def publish_diagnostics(self, health: list[Health]) -> None:
+        """Stamped with wall time: it is about processes, not about the simulated world."""
+        stamp = self._node.get_clock().now().to_msg()
+        self._diagnostics_pub.publish(convert.diagnostics(self._spec.robots, health, stamp))
+
+    def flush(self) -> None:
+        """Waits, within bounds, until every reader has the last episode state."""
+        self._episode_pub.wait_for_all_acked(Duration(seconds=_ACK_TIMEOUT_S))
