@@ -11,7 +11,7 @@ from crash_coach_pkg.config import CoachConfig, check_team
 from crash_coach_pkg.plan import CrashPlan, Fault, parse_mode
 from crash_coach_pkg.sampling import crash_cap, draw_exactly, draw_mask, episode_rng
 from crash_coach_pkg.strategies import Progress, make_strategy
-from sim_pkg.contract import BoolArray
+from sim_pkg.contract import BoolArray, UserError
 
 JsonScalar = int | float
 Decision = Literal["raise", "lower", "keep"]
@@ -39,13 +39,13 @@ class Coach:
         seed: keys every draw together with the episode, and the random actions of the plans.
 
     Raises:
-        ValueError: settings that this team cannot keep, or a negative seed.
+        UserError: settings that this team cannot keep, or a negative seed.
     """
 
     def __init__(self, config: CoachConfig, robots: tuple[str, ...], seed: int) -> None:
         check_team(config, robots)
         if not 0 <= seed < 2**63:
-            raise ValueError(f"seed {seed} is not in 0..2^63-1")
+            raise UserError(f"seed {seed} is not in 0..2^63-1")
         self._config = config
         self._robots = robots
         self._seed = seed
@@ -68,6 +68,24 @@ class Coach:
     def rate(self) -> float:
         """The nominal crash rate alpha in force."""
         return self._rate
+
+    def reconfigured(self, config: CoachConfig, seed: int) -> Coach:
+        """A coach with other settings that goes on from this one's rate.
+
+        Another strategy, or another rate to start from (fixed), starts at its own; alpha_max
+        holds at once. The counts of the realised crash fraction start again.
+
+        Raises:
+            UserError: as the constructor.
+        """
+        coach = Coach(config, self._robots, seed)
+        coach._revision = self._revision + 1
+        same = config.strategy == self._config.strategy
+        if same and coach._rate == self._strategy.initial_rate:
+            coach._rate = self._rate
+            if config.alpha_max is not None:
+                coach._rate = min(self._rate, config.alpha_max)
+        return coach
 
     @property
     def needs_success(self) -> bool:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from crash_coach_pkg.plan import NEXT_STEP
 from crash_coach_pkg.strategies import is_strategy, strategy_names
+from sim_pkg.contract import UserError
 
 CapRule = Literal["ceil", "floor", "authors"]
 
@@ -122,27 +125,39 @@ class CoachConfig(BaseModel):
         return self
 
 
+def check_robots(names: Sequence[str]) -> tuple[str, ...]:
+    """A team's names. Raises UserError unless they are distinct and fit for topic names."""
+    if not names:
+        raise UserError("robots is empty; name at least one robot")
+    for name in names:
+        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name):
+            raise UserError(f"robot name {name!r} is not a valid ROS name (letters, digits, _)")
+        if list(names).count(name) > 1:
+            raise UserError(f"robots names {name!r} more than once")
+    return tuple(names)
+
+
 def check_team(config: CoachConfig, robots: tuple[str, ...]) -> None:
     """Holds the settings against a team.
 
     Raises:
-        ValueError: an unknown robot, or limits that this team cannot keep.
+        UserError: an unknown robot, or limits that this team cannot keep.
     """
     n = len(robots)
     unknown = [name for name in config.victims if name not in robots]
     if unknown:
-        raise ValueError(f"unknown robot {unknown[0]!r} in victims; one of: {', '.join(robots)}")
+        raise UserError(f"unknown robot {unknown[0]!r} in victims; one of: {', '.join(robots)}")
     if config.min_alive > n:
-        raise ValueError(f"min_alive {config.min_alive} is more than the team's {n} robots")
+        raise UserError(f"min_alive {config.min_alive} is more than the team's {n} robots")
     if config.max_crashed > n:
-        raise ValueError(f"max_crashed {config.max_crashed} is more than the team's {n} robots")
+        raise UserError(f"max_crashed {config.max_crashed} is more than the team's {n} robots")
     limit = most_crashed(config, n)
     for key, wanted in (
         ("victims", len(config.victims)),
         ("crashed_exactly", config.crashed_exactly),
     ):
         if wanted > limit:
-            raise ValueError(
+            raise UserError(
                 f"{key} asks for {wanted} crashed robots, but min_alive {config.min_alive} and "
                 f"max_crashed {config.max_crashed} allow {limit} of {n}"
             )

@@ -65,6 +65,13 @@ class CrashPlan:
                 modes[fault.robot] = fault.mode
         return modes
 
+    def mode_of(self, step: int, robot: int) -> Mode:
+        """Mode of one robot at ``step``, as in modes_at."""
+        for fault in reversed(self.faults):
+            if fault.robot == robot and fault.covers(step):
+                return fault.mode
+        return Mode.NONE
+
     def resolved(self, next_step: int) -> CrashPlan:
         """The same plan with every NEXT_STEP replaced."""
         return replace(

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Protocol
 
+from sim_pkg.contract import UserError
+
 if TYPE_CHECKING:
     from crash_coach_pkg.config import CoachConfig
 
@@ -81,7 +83,7 @@ class Curriculum:
         if self.delta is not None:
             return min(self.alpha_max, self.delta * progress.episodes)
         if progress.total_steps <= 0:
-            raise ValueError(
+            raise UserError(
                 "strategy curriculum: the length of training is unknown (total_steps = "
                 f"{progress.total_steps}); set curriculum_delta, the increment per episode"
             )
@@ -149,7 +151,7 @@ def is_strategy(name: str) -> bool:
 
 
 def make_strategy(config: CoachConfig) -> Strategy:
-    """Raises ValueError where the name is not known."""
+    """Raises UserError where the name is not known."""
     factory = _FACTORIES.get(config.strategy)
     if factory is not None:
         return factory(config)
@@ -157,4 +159,4 @@ def make_strategy(config: CoachConfig) -> Strategy:
         loaded: StrategyFactory = point.load()
         return loaded(config)
     known = ", ".join(strategy_names())
-    raise ValueError(f"unknown coaching strategy {config.strategy!r}; one of: {known}")
+    raise UserError(f"unknown coaching strategy {config.strategy!r}; one of: {known}")
