@@ -40,6 +40,13 @@ class GraphClient:
                 raise WaitError(f"waited {timeout_s:g} s for {what}")
             self._executor.spin_once(timeout_sec=min(SPIN_S, left_s))
 
+    def pause(self, duration_s: float) -> None:
+        """Serves the node's callbacks for a while."""
+        end = time.monotonic() + duration_s
+        while (left_s := end - time.monotonic()) > 0:
+            self._check()
+            self._executor.spin_once(timeout_sec=min(SPIN_S, left_s))
+
     def result(self, future: Future, timeout_s: float, what: str) -> Any:
         """The result of a service call. Raises WaitError naming ``what``."""
         self.until(future.done, timeout_s, what)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +24,7 @@ from policy_pkg.train.evaluate import Condition, EpisodeResult, Evaluation
 from sim_pkg.contract import UserError
 
 START_S = 60.0  # until the sim serves /sim/reset; a cold start compiles the book-keeping
+RETRY_S = 0.05
 EPISODE_S = 60.0  # one episode; the sim itself gives up sooner where robots do not answer
 
 
@@ -122,13 +124,23 @@ class Collector:
         """Plays the sim's next episode, which has to be ``episode``."""
         self._episode, self._last = episode, None
         self._states.clear()
-        future = self._reset.call_async(Trigger.Request())
-        answer = self._client.result(future, START_S, f"/sim/reset before episode {episode}")
-        if not answer.success:
-            raise EvaluationError(f"/sim/reset before episode {episode}: {answer.message}")
+        self._start(episode)
         self._client.until(lambda: self._last is not None, EPISODE_S, f"episode {episode} to end")
         assert self._last is not None
         return self._result(self._last)
+
+    def _start(self, episode: int) -> None:
+        """Asks for the episode until the sim, which first looks for its robots, begins it."""
+        deadline = time.monotonic() + START_S
+        what = f"/sim/reset before episode {episode}"
+        while True:
+            future = self._reset.call_async(Trigger.Request())
+            answer = self._client.result(future, START_S, what)
+            if answer.success:
+                return
+            if time.monotonic() > deadline:
+                raise EvaluationError(f"{what}: {answer.message}")
+            self._client.pause(RETRY_S)
 
     def _result(self, last: EpisodeState) -> EpisodeResult:
         missing = [step for step in range(last.step + 1) if step not in self._states]

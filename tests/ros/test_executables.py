@@ -1,0 +1,140 @@
+"""Every executable is found and runs as `ros2 run` and the launch file would start it."""
+
+from __future__ import annotations
+
+import ast
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+import yaml
+from ament_index_python.packages import get_package_share_directory
+
+from crash_coach_bringup.ros.client import graph_client
+from crash_coach_bringup.ros.graph import (
+    GraphError,
+    Node,
+    UpOptions,
+    check_team,
+    graph_nodes,
+    node_process,
+)
+from crash_coach_bringup.ros.launch_arguments import ARGUMENTS, options_from
+from policy_pkg.untrained import write_untrained
+from sim_pkg.env import make_env
+
+SHARE = Path(get_package_share_directory("crash_coach_bringup"))
+DEFAULTS = {a.name: a.default or "" for a in ARGUMENTS}
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("team") / "step_0"
+    write_untrained(folder, make_env("buttons", 1).spec, seed=1)
+    return folder
+
+
+def launch_nodes(checkpoint: Path, **given: str) -> list[Node]:
+    options = options_from({**DEFAULTS, "checkpoint": str(checkpoint), **given})
+    return graph_nodes(options, check_team(options))
+
+
+def start(node: Node, env: dict[str, str]) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        node_process(node).argv,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=env,
+    )
+
+
+@pytest.mark.parametrize("layout", ["nodes", "team"])
+def test_each_executable_runs_appears_in_the_graph_and_ends_on_sigint(
+    checkpoint: Path, ros_env: dict[str, str], layout: str
+) -> None:
+    nodes = launch_nodes(checkpoint, layout=layout)
+    expected = {"sim", "coach", "gate"}
+    expected |= {"team"} if layout == "team" else {"policy_robot_1", "policy_robot_2"}
+    assert {node.name for node in nodes} == expected
+    children = {node.name: start(node, ros_env) for node in nodes}
+    said = {}
+    try:
+        with graph_client("looker") as client:
+            client.until(
+                lambda: expected <= set(client.node.get_node_names()), 20, f"{expected} to appear"
+            )
+        for child in children.values():
+            child.send_signal(signal.SIGINT)
+    finally:
+        for name, child in children.items():
+            try:
+                said[name], _ = child.communicate(timeout=10)
+            finally:
+                child.kill()
+    assert {
+        name: (child.returncode, said[name]) for name, child in children.items()
+    } == dict.fromkeys(expected, (0, ""))
+
+
+def test_the_launch_file_uses_nothing_that_does_not_exist() -> None:
+    path = SHARE / "launch" / "team.launch.py"
+    tree = ast.parse(path.read_text())
+    compile(tree, str(path), "exec")
+    defined = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+    assert "generate_launch_description" in defined
+    imports = {
+        (node.module, alias.name)
+        for node in tree.body
+        if isinstance(node, ast.ImportFrom) and node.module is not None
+        for alias in node.names
+    }
+    ours = {pair for pair in imports if pair[0].startswith("crash_coach_bringup")}
+    assert {name for _, name in ours} == {"ARGUMENTS", "options_from", "check_team", "graph_nodes"}
+    for module, name in ours:
+        assert hasattr(__import__(module, fromlist=[name]), name)
+    assert {m.partition(".")[0] for m, _ in imports - ours} == {
+        "__future__",
+        "launch",
+        "launch_ros",
+    }
+
+
+def test_every_launch_argument_reaches_the_graph(checkpoint: Path) -> None:
+    options = options_from(
+        {
+            "scenario": "buttons",
+            "checkpoint": str(checkpoint),
+            "mode": "lockstep",
+            "layout": "team",
+            "seed": "7",
+            "episodes": "3",
+            "rviz": "false",
+        }
+    )
+    assert options == UpOptions("buttons", checkpoint, "lockstep", "team", seed=7, episodes=3)
+    parameters = {node.name: node.parameters for node in graph_nodes(options, ("robot_1",))}
+    assert parameters["sim"]["seed"] == parameters["coach"]["seed"] == 7
+    assert parameters["sim"]["episodes"] == 3
+    assert parameters["gate"]["lockstep"] is True
+
+
+@pytest.mark.parametrize("name", ["seed", "episodes"])
+def test_a_launch_argument_that_is_no_number_is_named(checkpoint: Path, name: str) -> None:
+    with pytest.raises(GraphError, match=f"{name}:=-1"):
+        launch_nodes(checkpoint, **{name: "-1"})
+
+
+def test_an_executable_that_is_not_installed_is_named() -> None:
+    with pytest.raises(GraphError, match="no executable 'fly'"):
+        node_process(Node("x", "sim_pkg", "fly", {}))
+    with pytest.raises(GraphError, match="no_pkg is not on AMENT_PREFIX_PATH"):
+        node_process(Node("x", "no_pkg", "fly", {}))
+
+
+def test_the_rviz_layout_shows_topics_that_the_graph_has() -> None:
+    layout = yaml.safe_load((SHARE / "rviz" / "team.rviz").read_text())["Visualization Manager"]
+    assert layout["Global Options"]["Fixed Frame"] == "map"
+    topics = {d["Topic"]["Value"] for d in layout["Displays"] if "Topic" in d}
+    assert topics == {"/sim/markers", "/robot_1/odom", "/robot_2/odom"}
