@@ -4,24 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import torch
+from numba import njit
 from torch import Tensor
 
 from policy_pkg.train import packed_gru
 from policy_pkg.train.episode import Sizes
-from policy_pkg.train.packed_gru import Schedule
+from policy_pkg.train.packed_gru import Gates, GruWeights, Schedule
 from policy_pkg.train.parameters import Shapes, linear
 
-NAMES = (
-    "fc1.weight",
-    "fc1.bias",
-    "rnn.weight_ih",
-    "rnn.weight_hh",
-    "rnn.bias_ih",
-    "rnn.bias_hh",
-    "fc2.weight",
-    "fc2.bias",
-)
+Array = npt.NDArray[Any]
 
 
 def shapes(sizes: Sizes, hidden: int) -> tuple[Shapes, dict[str, int]]:
@@ -38,89 +32,121 @@ def shapes(sizes: Sizes, hidden: int) -> tuple[Shapes, dict[str, int]]:
     return named, {"fc1": sizes.input_size, "rnn": hidden, "fc2": hidden}
 
 
-def unroll(
-    online: dict[str, Tensor],
-    target: dict[str, Tensor],
-    inputs: Tensor,
-    taken: Tensor,
-    schedule: Schedule,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Action values of the online and the target net for every packed row.
+def unroll(params: dict[str, Tensor], inputs: Tensor, schedule: Schedule) -> Tensor:
+    """Action values (R, A) of the packed rows ``inputs`` (R, I), with gradient by autograd."""
+    q: Tensor = _Unroll.apply(inputs, schedule, *params.values())
+    return q
 
-    inputs: (R, I). taken: (C,) int64 flat indexes into the (R, A) values.
-    Returns the online net's values at ``taken`` (C,), which carry the gradient, and without
-    gradient all values (R, A) of the online and of the target net.
-    """
-    taken_q, online_q, target_q = _Unroll.apply(
-        *(inputs, taken, schedule, [target[name] for name in NAMES]),
-        *(online[name] for name in NAMES),
-    )
-    return taken_q, online_q, target_q
+
+def unroll_values(params: dict[str, Tensor], inputs: Tensor, schedule: Schedule) -> Tensor:
+    """As ``unroll``, without gradient and without keeping anything for one."""
+    arrays = [param.detach().numpy() for param in params.values()]
+    hidden, _, _ = _forward(arrays, inputs.numpy(), schedule, keep=False)
+    return _values(arrays, hidden)
+
+
+def _values(params: list[Array], hidden: Array) -> Tensor:
+    q = hidden @ params[6].T
+    q += params[7]
+    return torch.from_numpy(q)
 
 
 class _Unroll(torch.autograd.Function):
-    """Both nets side by side, since small operations cost more by their number than their size."""
+    """Whole sequences as one operation, so that autograd records nothing per time step."""
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        inputs: Tensor,
-        taken: Tensor,
-        schedule: Schedule,
-        target: list[Tensor],
-        *online: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        fc1_w, fc1_b, w_ih, w_hh, b_ih, b_hh = (
-            torch.stack(pair) for pair in zip(online[:6], target[:6], strict=True)
-        )
-        size = w_hh.shape[-1]
-        embedded = torch.addmm(fc1_b.view(-1), inputs, fc1_w.view(2 * size, -1).t()).relu_()
-        embedded_each = embedded.view(-1, 2, size).unbind(1)
-        gates = packed_gru.gates_bias(b_ih, b_hh).unsqueeze(1).repeat(1, inputs.shape[0], 1)
-        w_input = packed_gru.input_weight(w_ih)
-        for net in range(2):
-            gates[net, :, : 3 * size].addmm_(embedded_each[net], w_input[net].t())
-        hidden = packed_gru.forward(gates, w_hh, schedule)
-        online_q = torch.addmm(online[7], hidden[0], online[6].t())
-        target_q = torch.addmm(target[7], hidden[1], target[6].t())
-        ctx.save_for_backward(
-            *(inputs, taken, embedded_each[0], gates[0], hidden[0], online[3], online[6]),
-            w_input[0],
-        )
-        ctx.schedule = schedule
-        ctx.mark_non_differentiable(online_q, target_q)
-        ctx.set_materialize_grads(False)
-        return online_q.view(-1).take(taken), online_q, target_q
+    def forward(ctx: Any, inputs: Tensor, schedule: Schedule, *params: Tensor) -> Tensor:
+        arrays = [param.numpy() for param in params]
+        hidden, embedded, gates = _forward(arrays, inputs.numpy(), schedule, keep=True)
+        # Not ctx.save_for_backward: these are numpy arrays that nothing else can change.
+        ctx.saved = (arrays, inputs.numpy(), schedule, hidden, embedded, gates)
+        return _values(arrays, hidden)
 
     @staticmethod
-    def backward(ctx: Any, grad_taken: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        inputs, taken, embedded, gates, hidden, w_hh, fc2_w, w_input = ctx.saved_tensors
-        schedule: Schedule = ctx.schedule
-        size = hidden.shape[1]
-        grad_q = hidden.new_zeros(hidden.shape[0], fc2_w.shape[0])
-        grad_q.view(-1).index_copy_(0, taken, grad_taken)
-        before = _previous(hidden, schedule)
-        grad_gates = packed_gru.backward(gates, before, w_hh, grad_q @ fc2_w, schedule)
-        grad_in, grad_rec = grad_gates[:, : 3 * size], grad_gates[:, size:]
-        grad_w_input = grad_in.t() @ embedded
-        grad_embedded = grad_in @ w_input
-        grad_fc1 = torch.ops.aten.threshold_backward(grad_embedded, embedded, 0)
-        sums = grad_gates.sum(0)
-        return (
-            *(None, None, None, None),
-            grad_fc1.t() @ inputs,
-            grad_fc1.sum(0),
-            grad_w_input.roll(-size, 0),
-            grad_rec[schedule.first :].t() @ before,
-            sums[: 3 * size].roll(-size, 0),
-            sums[size:],
-            grad_q.t() @ hidden,
-            grad_q.sum(0),
-        )
+    def backward(ctx: Any, grad_q: Tensor) -> tuple[Tensor | None, ...]:
+        grads = _backward(grad_q.numpy(), *ctx.saved)
+        return (None, None, *(torch.from_numpy(grad) for grad in grads))
 
 
-def _previous(hidden: Tensor, schedule: Schedule) -> Tensor:
-    """(R, H) -> (R - first, H) the hidden state before each row of the times after 0."""
-    steps = hidden.split_with_sizes(schedule.sizes)
-    later = schedule.sizes[1:]
-    return torch.cat([step[:rows] for step, rows in zip(steps, later, strict=False)])
+def _forward(
+    params: list[Array], inputs: Array, schedule: Schedule, keep: bool
+) -> tuple[Array, Array, Gates]:
+    """Hidden states (R, H); embedded inputs and gates of all rows, or scratch without ``keep``."""
+    fc1_w, fc1_b, w_ih, w_hh, b_ih, b_hh = params[:6]
+    size, dtype, most = w_hh.shape[1], w_hh.dtype, schedule.sizes[0]
+    weights = GruWeights.prepare(w_ih, w_hh, b_ih, b_hh)
+    fc1 = np.ascontiguousarray(fc1_w.T)
+    hidden = np.empty((schedule.rows, size), dtype)
+    kept = schedule.rows if keep else most
+    embedded, gates = np.empty((kept, size), dtype), Gates.empty(kept, size, dtype)
+    scratch = np.empty((2, most, 3 * size), dtype)
+    before = np.zeros((most, size), dtype)
+    for rows in schedule.slices():
+        count = rows.stop - rows.start
+        place = rows if keep else slice(0, count)
+        x = embedded[place]
+        np.matmul(inputs[rows], fc1, out=x)
+        _bias_relu(x, fc1_b)
+        out = hidden[rows]
+        packed_gru.step(weights, x, before[:count], out, gates.of(place), scratch)
+        before = out
+    return hidden, embedded, gates
+
+
+def _backward(
+    grad_q: Array,
+    params: list[Array],
+    inputs: Array,
+    schedule: Schedule,
+    hidden: Array,
+    embedded: Array,
+    gates: Gates,
+) -> list[Array]:
+    """Gradients of the parameters, in their order."""
+    w_ih, w_hh, fc2_w = params[2], params[3], params[6]
+    size, most = hidden.shape[1], schedule.sizes[0]
+    w_input = np.roll(w_ih, size, 0)  # r, z, n -> n, r, z, the order of the gates' gradients
+    grad_hidden = grad_q @ fc2_w
+    grad_gates = np.empty((len(hidden), 4 * size), hidden.dtype)
+    grad_embedded = np.empty_like(embedded)
+    previous = np.zeros_like(hidden)
+    start = np.zeros((most, size), hidden.dtype)
+    slices = schedule.slices()
+    for t in range(len(slices) - 1, -1, -1):
+        rows = slices[t]
+        earlier = slice(slices[t - 1].start, slices[t - 1].start + schedule.sizes[t])
+        before = hidden[earlier] if t else start
+        previous[rows] = before
+        into = grad_hidden[earlier] if t else start.copy()
+        out = grad_gates[rows]
+        packed_gru.step_back(w_hh, gates.of(rows), before, grad_hidden[rows], out, into)
+        np.matmul(out[:, : 3 * size], w_input, out=grad_embedded[rows])
+        _relu_back(grad_embedded[rows], embedded[rows])
+    sums = grad_gates.sum(0)
+    return [
+        (inputs.T @ grad_embedded).T,
+        grad_embedded.sum(0),
+        np.roll((embedded.T @ grad_gates[:, : 3 * size]).T, -size, 0),
+        (previous.T @ grad_gates[:, size:]).T,
+        np.roll(sums[: 3 * size], -size),
+        sums[size:],
+        grad_q.T @ hidden,
+        grad_q.sum(0),
+    ]
+
+
+@njit(cache=True)
+def _bias_relu(x: Array, bias: Array) -> None:
+    zero = bias.dtype.type(0.0)
+    for i in range(x.shape[0]):
+        for j in range(x.shape[1]):
+            x[i, j] = max(x[i, j] + bias[j], zero)
+
+
+@njit(cache=True)
+def _relu_back(grad: Array, value: Array) -> None:
+    zero = grad.dtype.type(0.0)
+    for i in range(grad.shape[0]):
+        for j in range(grad.shape[1]):
+            if value[i, j] <= zero:
+                grad[i, j] = zero

@@ -125,15 +125,13 @@ class Learner:
         n = self.sizes.n_robots
         now, actions = torch.from_numpy(batch.now), torch.from_numpy(batch.actions)
         first = int(batch.alive[0])
+        schedule = Schedule([int(rows) * n for rows in batch.alive])
+        inputs = self._tensor(batch.inputs).view(-1, self.sizes.input_size)
+        q_target = agent_net.unroll_values(self._parts["target", "agent"], inputs, schedule)
+        q = agent_net.unroll(self._parts["online", "agent"], inputs, schedule)
         taken_index = (now * (n * self.sizes.n_actions)).unsqueeze(1) + actions + self._robot_offset
-        taken, q_online, q_target = agent_net.unroll(
-            self._parts["online", "agent"],
-            self._parts["target", "agent"],
-            self._tensor(batch.inputs).view(-1, self.sizes.input_size),
-            taken_index.view(-1),
-            Schedule([int(rows) * n for rows in batch.alive]),
-        )
-        taken = taken.view(-1, n)
+        taken = q.view(-1).gather(0, taken_index.view(-1)).view(-1, n)
+        q_online = q.detach()
         with torch.no_grad():
             shape = (len(now), n, self.sizes.n_actions)
             following = self._next_values(

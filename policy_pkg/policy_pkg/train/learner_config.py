@@ -13,32 +13,47 @@ class LearnerConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     algorithm: Literal["qmix", "vdn", "iql"] = Field(
-        "qmix", description="qmix: monotonic mixer; vdn: sum; iql: team reward to each robot"
+        default="qmix",
+        description="qmix: monotonic mixer; vdn: sum; iql: team reward to each robot",
     )
-    hidden: int = Field(64, ge=1, le=4096, description="units of the agent net's layers and GRU")
-    mixing_hidden: int = Field(32, ge=1, le=4096, description="units of the QMIX mixing layer")
-    hypernet_hidden: int = Field(64, ge=1, le=4096, description="units of the QMIX hypernetworks")
-    gamma: float = Field(0.99, ge=0.0, le=1.0, description="discount per environment step")
-    lr: float = Field(5e-4, gt=0.0, le=1.0, description="learning rate")
-    optimiser: Literal["rmsprop", "adam"] = Field("rmsprop", description="gradient method")
+    hidden: int = Field(
+        default=64, ge=1, le=4096, description="units of the agent net's layers and GRU"
+    )
+    mixing_hidden: int = Field(
+        default=32, ge=1, le=4096, description="units of the QMIX mixing layer"
+    )
+    hypernet_hidden: int = Field(
+        default=64, ge=1, le=4096, description="units of the QMIX hypernetworks"
+    )
+    gamma: float = Field(default=0.99, ge=0.0, le=1.0, description="discount per environment step")
+    lr: float = Field(default=5e-4, gt=0.0, le=1.0, description="learning rate")
+    optimiser: Literal["rmsprop", "adam"] = Field(default="rmsprop", description="gradient method")
     optim_alpha: float = Field(
-        0.99, ge=0.0, lt=1.0, description="smoothing of RMSprop's squared gradient; unused by adam"
+        default=0.99,
+        ge=0.0,
+        lt=1.0,
+        description="smoothing of RMSprop's squared gradient; unused by adam",
     )
-    optim_eps: float = Field(1e-5, gt=0.0, le=1.0, description="added to the root; both optimisers")
+    optim_eps: float = Field(
+        default=1e-5, gt=0.0, le=1.0, description="added to the root; both optimisers"
+    )
     grad_norm_clip: float = Field(
-        10.0, gt=0.0, description="bound of the joint gradient norm of agent net and mixer"
+        default=10.0, gt=0.0, description="bound of the joint gradient norm of agent net and mixer"
     )
     target_update_interval_episodes: int = Field(
-        200, ge=1, description="finished training episodes between two copies to the target nets"
+        default=200,
+        ge=1,
+        description="finished training episodes between two copies to the target nets",
     )
     double_q: bool = Field(
-        True, description="choose the next action by the online net, value it by the target net"
+        default=True,
+        description="choose the next action by the online net, value it by the target net",
     )
     crashed_loss: Literal["keep", "drop"] = Field(
-        "keep", description="drop: crashed robots do not enter the loss (iql only)"
+        default="keep", description="drop: crashed robots do not enter the loss (iql only)"
     )
     crashed_target: Literal["max", "mean", "stay"] = Field(
-        "max",
+        default="max",
         description="next value of a crashed robot: best action, mean over the available "
         "actions (random crash), or the stay action's value",
     )

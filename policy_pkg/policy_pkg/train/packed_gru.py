@@ -1,4 +1,4 @@
-"""A GRU over a packed batch: forward and backward of whole sequences, without autograd.
+"""A GRU over a packed batch: one time step forward or backward, in numpy, without autograd.
 
 Equations (torch.nn.GRU; gate order of the weights r, z, n), for input x and hidden state h::
 
@@ -7,18 +7,22 @@ Equations (torch.nn.GRU; gate order of the weights r, z, n), for input x and hid
     n = tanh(W_in x + b_in + r * (W_hn h + b_hn))
     h' = (1 - z) * n + z * h
 
-All that does not depend on h is done once for every packed row; the loop over time holds only
-the recurrent product and the gates, in place. The gates lie in one array in the order
-[n, r, z, W_hn h + b_hn]: its first three blocks take the input product, its last three the
-recurrent one, and both are single matrix products.
+sigmoid(x) = (1 + tanh(x / 2)) / 2, since numpy's tanh is vectorised and torch's is several times
+slower; the halving is exact and sits in the prepared weights. numpy's BLAS also is the faster one
+for these small matrices, and few rows at a time stay in the cache. The element-wise rest is
+compiled, one pass per step.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
-import torch
-from torch import Tensor
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -31,87 +35,136 @@ class Schedule:
     sizes: list[int]
 
     @property
-    def first(self) -> int:
-        """Rows of time 0, which have no predecessor."""
-        return self.sizes[0]
+    def rows(self) -> int:
+        return sum(self.sizes)
+
+    def slices(self) -> list[slice]:
+        """The rows of each time."""
+        ends = np.cumsum(self.sizes).tolist()
+        return [slice(end - size, end) for end, size in zip(ends, self.sizes, strict=True)]
 
 
-def input_weight(weight_ih: Tensor) -> Tensor:
-    """(..., 3H, H) in torch's order r, z, n -> n, r, z, the order of the gates' first blocks."""
-    return weight_ih.roll(weight_ih.shape[-1], -2)
+@dataclass(frozen=True)
+class GruWeights:
+    """Weights as the steps need them; made anew after every change of the parameters."""
+
+    inputs: Array  # (H, 3H) W_i transposed, r and z halved
+    recurrent: Array  # (H, 3H) W_h transposed, r and z halved
+    bias: Array  # (4H,) halved sums for r and z, b_in, b_hn
+
+    @classmethod
+    def prepare(cls, w_ih: Array, w_hh: Array, b_ih: Array, b_hh: Array) -> GruWeights:
+        size = w_hh.shape[1]
+        bias = np.concatenate((b_ih + b_hh, b_hh[2 * size :]))
+        bias[2 * size : 3 * size] = b_ih[2 * size :]
+        bias[: 2 * size] /= 2
+        inputs, recurrent = (np.ascontiguousarray(w.T) for w in (w_ih, w_hh))
+        inputs[:, : 2 * size] /= 2
+        recurrent[:, : 2 * size] /= 2
+        return cls(inputs, recurrent, bias)
 
 
-def gates_bias(bias_ih: Tensor, bias_hh: Tensor) -> Tensor:
-    """(..., 3H) twice -> (..., 4H): what the gates' blocks start from, before any product."""
-    hidden = bias_ih.shape[-1] // 3
-    rz_in, n_in = bias_ih.split_with_sizes((2 * hidden, hidden), -1)
-    rz_hid, n_hid = bias_hh.split_with_sizes((2 * hidden, hidden), -1)
-    return torch.cat((n_in, rz_in + rz_hid, n_hid), -1)
+@dataclass(frozen=True)
+class Gates:
+    """What a forward pass leaves for the backward one, by row."""
+
+    rz: Array  # (R, 2H)
+    n: Array  # (R, H)
+    n_hidden: Array  # (R, H) W_hn h + b_hn
+
+    @classmethod
+    def empty(cls, rows: int, size: int, dtype: npt.DTypeLike) -> Gates:
+        return cls(
+            np.empty((rows, 2 * size), dtype),
+            np.empty((rows, size), dtype),
+            np.empty((rows, size), dtype),
+        )
+
+    def of(self, rows: slice) -> Gates:
+        return Gates(self.rz[rows], self.n[rows], self.n_hidden[rows])
 
 
-def forward(gates: Tensor, weight_hh: Tensor, schedule: Schedule) -> Tensor:
-    """Unrolls K nets side by side from zero hidden states.
+def step(
+    weights: GruWeights, x: Array, before: Array, out: Array, gates: Gates, scratch: Array
+) -> None:
+    """One time step of m rows: fills the hidden states ``out`` (m, H) and ``gates``.
 
-    gates: (K, R, 4H) biases and input products; overwritten by the gates' values.
-    weight_hh: (K, 3H, H). Returns the hidden states (K, R, H).
+    x, before: (m, H). scratch: (2, >= m, 3H).
     """
-    nets, rows, width = gates.shape
-    size = width // 4
-    hidden = gates.new_empty(nets, rows, size)
-    steps = hidden.split_with_sizes(schedule.sizes, 1)
-    recurrent = gates[:, :, size:].split_with_sizes(schedule.sizes, 1)
-    sigmoids = gates[:, :, size : 3 * size].split_with_sizes(schedule.sizes, 1)
-    n, r, z, n_hidden = (block.split_with_sizes(schedule.sizes, 1) for block in gates.chunk(4, 2))
-    product = weight_hh.transpose(1, 2)
-    for t, rows_now in enumerate(schedule.sizes):
-        if t == 0:
-            sigmoids[t].sigmoid_()
-            n[t].addcmul_(r[t], n_hidden[t]).tanh_()
-            torch.addcmul(n[t], n[t], z[t], value=-1, out=steps[t])
-        else:
-            before = steps[t - 1].narrow(1, 0, rows_now)
-            recurrent[t].baddbmm_(before, product)
-            sigmoids[t].sigmoid_()
-            n[t].addcmul_(r[t], n_hidden[t]).tanh_()
-            torch.lerp(n[t], before, z[t], out=steps[t])
-    return hidden
+    rows = len(x)
+    from_input, from_hidden = scratch[0, :rows], scratch[1, :rows]
+    np.matmul(x, weights.inputs, out=from_input)
+    np.matmul(before, weights.recurrent, out=from_hidden)
+    _sum_gates(from_input, from_hidden, weights.bias, gates.rz, gates.n_hidden)
+    np.tanh(gates.rz, out=gates.rz)
+    _candidate(gates.rz, from_input, gates.n_hidden, weights.bias, gates.n)
+    np.tanh(gates.n, out=gates.n)
+    _blend(gates.n, gates.rz, before, out)
 
 
-def backward(
-    gates: Tensor, before: Tensor, weight_hh: Tensor, grad: Tensor, schedule: Schedule
-) -> Tensor:
-    """Gradient of the loss with respect to the gates' sums, (R, 4H), blocks as in ``gates``.
+def step_back(
+    w_hh: Array, gates: Gates, before: Array, grad: Array, out: Array, grad_before: Array
+) -> None:
+    """Backward of ``step``.
 
-    gates: (R, 4H) values that ``forward`` left, for one net.
-    before: (R - first, H) hidden states before each row of the times after 0.
-    weight_hh: (3H, H). grad: (R, H) with respect to the hidden states; overwritten.
+    grad: (m, H) of the loss with respect to the step's hidden states. out: (m, 4H), becomes the
+    gradient with respect to [W_in x + b_in, the sums of r and z, W_hn h + b_hn], so that its first
+    three blocks belong to the input product and its last three to the recurrent one.
+    grad_before: (m, H), to which the gradient with respect to ``before`` is added.
     """
-    size = before.shape[1]
-    out = _local_gradients(gates, before, schedule.first)
-    z = gates[:, 2 * size : 3 * size].split_with_sizes(schedule.sizes)
-    blocks = out.view(-1, 4, size).split_with_sizes(schedule.sizes)
-    recurrent = out[:, size:].split_with_sizes(schedule.sizes)
-    grads = grad.split_with_sizes(schedule.sizes)
-    wide = grad.unsqueeze(1).split_with_sizes(schedule.sizes)
-    for t in range(len(schedule.sizes) - 1, -1, -1):
-        blocks[t].mul_(wide[t])
-        if t > 0:
-            into = grads[t - 1].narrow(0, 0, schedule.sizes[t])
-            into.addcmul_(grads[t], z[t]).addmm_(recurrent[t], weight_hh)
-    return out
+    _gate_gradients(grad, gates.rz, gates.n, gates.n_hidden, before, out, grad_before)
+    grad_before += out[:, before.shape[1] :] @ w_hh
 
 
-def _local_gradients(gates: Tensor, before: Tensor, first: int) -> Tensor:
-    """d h' / d (sums of the gates) of each row on its own, (R, 4H)."""
-    n, r, z, n_hidden = gates.chunk(4, 1)
-    out = torch.empty_like(gates)
-    d_n, d_r, d_z, d_hidden = out.chunk(4, 1)
-    z_left = 1 - z
-    torch.mul(n, n, out=d_n)
-    torch.addcmul(z_left, z_left, d_n, value=-1, out=d_n)  # (1 - z) (1 - n^2)
-    torch.mul(d_n, r, out=d_hidden)
-    torch.addcmul(d_hidden, d_hidden, r, value=-1, out=d_r).mul_(n_hidden)
-    torch.mul(z, z_left, out=d_z)
-    d_z[:first].mul_(n[:first].neg())
-    d_z[first:].mul_(before - n[first:])
-    return out
+@njit(cache=True)
+def _sum_gates(
+    from_input: Array, from_hidden: Array, bias: Array, rz: Array, n_hidden: Array
+) -> None:
+    rows, size = n_hidden.shape
+    for i in range(rows):
+        for j in range(2 * size):
+            rz[i, j] = from_input[i, j] + from_hidden[i, j] + bias[j]
+        for j in range(size):
+            n_hidden[i, j] = from_hidden[i, 2 * size + j] + bias[3 * size + j]
+
+
+@njit(cache=True)
+def _candidate(rz: Array, from_input: Array, n_hidden: Array, bias: Array, n: Array) -> None:
+    rows, size = n.shape
+    half = rz.dtype.type(0.5)
+    for i in range(rows):
+        for j in range(2 * size):
+            rz[i, j] = half * rz[i, j] + half
+        for j in range(size):
+            n[i, j] = from_input[i, 2 * size + j] + bias[2 * size + j] + rz[i, j] * n_hidden[i, j]
+
+
+@njit(cache=True)
+def _blend(n: Array, rz: Array, before: Array, out: Array) -> None:
+    rows, size = n.shape
+    for i in range(rows):
+        for j in range(size):
+            out[i, j] = n[i, j] + rz[i, size + j] * (before[i, j] - n[i, j])
+
+
+@njit(cache=True)
+def _gate_gradients(
+    grad: Array,
+    rz: Array,
+    n: Array,
+    n_hidden: Array,
+    before: Array,
+    out: Array,
+    grad_before: Array,
+) -> None:
+    rows, size = n.shape
+    one = rz.dtype.type(1.0)
+    for i in range(rows):
+        for j in range(size):
+            r, z, candidate, g = rz[i, j], rz[i, size + j], n[i, j], grad[i, j]
+            d_n = g * (one - z) * (one - candidate * candidate)
+            out[i, j] = d_n
+            out[i, size + j] = d_n * n_hidden[i, j] * r * (one - r)
+            out[i, 2 * size + j] = g * (before[i, j] - candidate) * z * (one - z)
+            out[i, 3 * size + j] = d_n * r
+            grad_before[i, j] += g * z

@@ -1,0 +1,126 @@
+"""Benchmark rows of the learner: the gradient step against a plain padded one, and the replay.
+
+Run alone: ``OMP_NUM_THREADS=1 python benchmarks/bench_learner.py``. Both learners take their
+batches of the same episodes in turn, in one process and one thread; medians.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from policy_pkg.train.episode import Episode, Sizes
+from policy_pkg.train.learner import Learner
+from policy_pkg.train.learner_config import LearnerConfig
+from policy_pkg.train.replay import Replay
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from padded_learner import PaddedLearner, PaddedReplay
+
+COMBAT = Sizes(n_robots=8, n_actions=14, obs_size=128, state_size=216, episode_limit=60)
+BUTTONS = Sizes(n_robots=2, n_actions=5, obs_size=2, state_size=8, episode_limit=20)
+BATCH_EPISODES = 32
+STORED_EPISODES = 128
+
+Row = dict[str, Any]
+
+
+def random_episode(sizes: Sizes, rng: np.random.Generator, steps: int) -> Episode:
+    """Random content; the last step terminates."""
+    n, actions = sizes.n_robots, sizes.n_actions
+    available = rng.random((steps + 1, n, actions)) < 0.7
+    available[..., 0] = True
+    return Episode(
+        obs=rng.standard_normal((steps + 1, n, sizes.obs_size), dtype=np.float32),
+        state=rng.standard_normal((steps + 1, sizes.state_size), dtype=np.float32),
+        available=available,
+        actions=rng.integers(0, actions, (steps, n), dtype=np.int32),
+        reward=rng.standard_normal(steps, dtype=np.float32),
+        faults=np.zeros((steps, n), np.uint8),
+        terminated=True,
+    )
+
+
+def gradient_step_ms(sizes: Sizes, full_lengths: bool, repeats: int) -> tuple[float, float]:
+    """Median times of (ours, padded), each with taking the batch from its replay, in turn."""
+    rng = np.random.default_rng(0)
+    limit = sizes.episode_limit
+    # "real": lengths uniform up to the limit, so their mean is half of the maximum.
+    lengths = [
+        limit if full_lengths else int(rng.integers(1, limit + 1)) for _ in range(STORED_EPISODES)
+    ]
+    episodes = [random_episode(sizes, rng, steps) for steps in lengths.tolist()]
+    replay, padded_replay = Replay(STORED_EPISODES, sizes), PaddedReplay(sizes, episodes)
+    for episode in episodes:
+        replay.add(episode)
+    learner, padded = Learner(LearnerConfig(), sizes, seed=0), PaddedLearner(sizes, seed=0)
+    ours_s, padded_s = [], []
+    for repeat in range(repeats + 2):
+        slots = rng.choice(STORED_EPISODES, BATCH_EPISODES, replace=False)
+        start = time.perf_counter()
+        learner.update(replay.gather(slots), episodes=0)
+        middle = time.perf_counter()
+        padded.update(padded_replay, slots)
+        end = time.perf_counter()
+        if repeat >= 2:  # the first ones warm up
+            ours_s.append(middle - start)
+            padded_s.append(end - middle)
+    return 1e3 * statistics.median(ours_s), 1e3 * statistics.median(padded_s)
+
+
+def _step_row(name: str, sizes: Sizes, full_lengths: bool, target: float | None) -> Row:
+    ours, padded = gradient_step_ms(sizes, full_lengths, 100 if sizes is BUTTONS else 25)
+    return {
+        "name": name,
+        "value": round(ours, 2),
+        "unit": "ms",
+        "reference": round(padded, 2),
+        "ratio": round(padded / ours, 2),
+        "target": f"ratio >= {target}" if target is not None else None,
+        "ok": target is None or padded / ours >= target,
+    }
+
+
+def _replay_row() -> Row:
+    """Stated memory of 5,000 combat episodes; and what half-filled ones really commit."""
+    replay = Replay(5000, COMBAT)
+    bound = replay.nbytes_bound
+    limit = 5000 * (
+        61 * (8 * 128 * 4 + 216 * 4 + 8 * 14) + 60 * (8 * 4 + 4 + 8) + 9
+    )  # float32 observations and states, bytes for masks, int32 actions
+    return {
+        "name": "replay 5000 episodes, bound",
+        "value": round(bound / 2**20),
+        "unit": "MiB",
+        "reference": round(limit / 2**20),
+        "ratio": round(limit / bound, 2),
+        "target": "no more than its arrays' sizes",
+        "ok": bound <= limit,
+    }
+
+
+def rows() -> list[Row]:
+    """All rows: {name, value, unit, reference, ratio, target, ok}."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return [
+            _step_row("gradient step, real length mix", COMBAT, False, 1.7),
+            _step_row("gradient step, full lengths", COMBAT, True, 1.0),
+            _step_row("gradient step, buttons", BUTTONS, False, None),
+            _replay_row(),
+        ]
+    finally:
+        torch.set_num_threads(threads)
+
+
+if __name__ == "__main__":
+    for row in rows():
+        print(json.dumps(row))
