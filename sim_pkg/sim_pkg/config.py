@@ -105,7 +105,10 @@ def validate(tree: YamlTree, model: type[ModelT]) -> ModelT:
     try:
         return model.model_validate(tree.values)
     except ValidationError as error:
-        problems = error.errors(include_url=False)
+        # A misspelt key is also a missing one: the misspelling says more.
+        problems = sorted(
+            error.errors(include_url=False), key=lambda p: p["type"] != "extra_forbidden"
+        )
         text = _describe(tree, model, dict(problems[0]))
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         raise ConfigError(text + more) from error
@@ -159,12 +162,10 @@ def _known_keys(model: type[BaseModel], location: _Location) -> list[str]:
     """The keys that a model accepts at ``location``."""
     kind: Any = model
     for part in location:
-        if isinstance(kind, type) and issubclass(kind, BaseModel):
-            if part not in kind.model_fields:
-                return []
-            kind = kind.model_fields[str(part)].annotation
+        if isinstance(part, str):  # an index stays within the same annotation
+            kind = kind.model_fields[part].annotation
         kind = _inner_model(kind)
-    return sorted(kind.model_fields) if kind is not None else []
+    return sorted(kind.model_fields)
 
 
 def _inner_model(kind: Any) -> type[BaseModel] | None:

@@ -1,0 +1,104 @@
+"""Bad scenario files: each error names file, line, key and value, and says what is right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sim_pkg.config import SCENARIOS_DIR, ConfigError, StrictModel, load_yaml_strict
+from sim_pkg.env import make_env, scenario_names
+
+GOOD = (SCENARIOS_DIR / "buttons.yaml").read_text()
+STARTS = "  - [2, 1]\n  - [7, 8]\n"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("episode_limit:", "episode_limt:", r"bad.yaml:8: .*'episode_limt'.*mean 'episode_limit'"),
+        ("  radius_m:", "  radios_m:", r"'robot.radios_m' \(did you mean 'radius_m'\?\)"),
+        ("dt_s: 1.0", "dt_s: .nan", r"bad.yaml:7: dt_s = nan: .*finite"),
+        ("dt_s: 1.0", "dt_s: .inf", r"dt_s = inf: .*finite"),
+        ("dt_s: 1.0", "dt_s: -1.0", r"dt_s = -1.0: .*greater than 0"),
+        ("dt_s: 1.0", "dt_s: fast", r"dt_s = 'fast': .*number"),
+        ("dt_s: 1.0", "dt_s: 1.0\ndt_s: 2.0", r"bad.yaml:8: key 'dt_s' again, first in line 7"),
+        ("rows: 10\n", "", r"key 'rows' is missing"),
+        ("- [2, 1]", "- [2, 10]", r"cell \[2, 10\] is outside the grid; rows are 0..9"),
+        ("- [2, 1]", "- [-1, 1]", r"bad.yaml:10: starts.0.0 = -1: .*greater than or equal to 0"),
+        ("- [2, 1]", "- [2, 4]", r"cell \[2, 4\] is a button"),
+        (STARTS, " []\n", r"starts = \[\]: .*at least 1"),
+        ("- [7, 5]", "- [2, 4]", r"two buttons in the same cell"),
+        ("radius_m: 0.4", "radius_m: 0.6", r"radius_m: 0.6 does not fit a cell; at most 0.5"),
+        ("max_speed_mps: 1.5", "max_speed_mps: 1.0", r"max_speed_mps: 1.0 is too slow"),
+        ("substeps: 8", "substeps: 1", r"physics.substeps = 1: .*greater than or equal to 4"),
+        ("kind: buttons", "kind: button", r"kind = 'button' \(did you mean 'buttons'\?\)"),
+        ("kind: buttons", "", r"kind = None; one of: buttons"),
+        ("rows: 10", "rows: [10", r"not valid YAML"),
+    ],
+)
+def test_bad_scenarios(tmp_path: Path, old: str, new: str, message: str) -> None:
+    assert GOOD.count(old) == 1
+    path = tmp_path / "bad.yaml"
+    path.write_text(GOOD.replace(old, new))
+    with pytest.raises(ConfigError, match=message) as error:
+        make_env(path, 1)
+    assert "bad.yaml" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_unknown_scenario_names_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"unknown scenario 'butons'.*'buttons'.*buttons_8"):
+        make_env("butons", 1)
+    with pytest.raises(ConfigError, match="no scenario file"):
+        make_env(tmp_path / "none.yaml", 1)
+
+
+def test_every_shipped_scenario_loads() -> None:
+    assert {"buttons", "buttons_8", "buttons_16"} <= set(scenario_names())
+    for name in scenario_names():
+        assert make_env(name, 1).spec.scenario == name
+
+
+def test_a_path_works_like_a_name(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(GOOD)
+    assert make_env(path, 1).spec.robots == make_env("buttons", 1).spec.robots
+
+
+class Inner(StrictModel):
+    depth: int = 1
+
+
+class Outer(StrictModel):
+    rate: float
+    items: tuple[Inner, ...] = ()
+    maybe: Inner | None = None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("rate: 1\nitems:\n  - depht: 2\n", "file.yaml:3: .*'items.0.depht'.*'depth'"),
+        ("rate: 1\nmaybe: {deep: 2}\n", "'maybe.deep'.*known keys: depth"),
+        ("- 1\n", "expected a mapping"),
+        ("", "expected a mapping"),
+        ("rate: 1\nitems: 3\nwrong: 2\n", r"\(and 1 more\)"),
+    ],
+)
+def test_strict_loading(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "file.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        load_yaml_strict(path, Outer)
+
+
+def test_numbers_without_a_point_are_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "file.yaml"
+    path.write_text("rate: 1e-3\n")
+    assert load_yaml_strict(path, Outer).rate == 1e-3
+
+
+def test_a_file_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none\.yaml: cannot be read: No such file"):
+        load_yaml_strict(tmp_path / "none.yaml", Outer)
