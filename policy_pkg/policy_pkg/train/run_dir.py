@@ -40,18 +40,18 @@ class RunError(UserError):
 
 
 def prepare_run(out_dir: Path, config: TrainConfig, resume: bool) -> None:
-    """Makes ``out_dir`` a run of ``config``, or checks that it is one already.
+    """Makes ``out_dir`` a run of ``config``; with ``resume``, one that is there already will do.
 
     Raises:
-        RunError: it holds a run and ``resume`` is off; there is nothing to resume; the run has
-            another config (the text names the first key that differs); or it holds other things.
+        RunError: it holds a run and ``resume`` is off; that run has another config (the text
+            names the first key that differs); or ``out_dir`` holds other things.
     """
     described = out_dir / RUN
-    if resume:
+    if described.exists():
+        if not resume:
+            raise RunError(f"{out_dir} already holds a run: resume it, or choose another directory")
         _check_same(read_run(out_dir), config, described)
         return
-    if described.exists():
-        raise RunError(f"{out_dir} already holds a run: resume it, or choose another directory")
     # A .partial file is what a killed process leaves.
     if out_dir.is_dir() and any(p.suffix != ".partial" for p in out_dir.iterdir()):
         raise RunError(f"{out_dir} is not empty and holds no run: choose another directory")
@@ -73,7 +73,7 @@ def read_run(out_dir: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise RunError(f"{out_dir} holds no run to resume: {RUN} is missing") from None
+        raise RunError(f"{out_dir} holds no run: {RUN} is missing") from None
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise RunError(f"{path} cannot be read: {error}") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:

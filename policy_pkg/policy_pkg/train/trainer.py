@@ -38,10 +38,10 @@ class TrainError(UserError):
 
 @dataclass(frozen=True)
 class ProgressReport:
-    """Where a run stands; the callback gets one a few times per second.
+    """Where a run stands; from the first step on, the callback gets one a few times per second.
 
-    success_rate, success_crash_free: of the last evaluation block; None before it or where not
-    measured. steps_per_s, eta_s: from the last seconds; None until there is something to measure.
+    success_rate, success_crash_free: of the last evaluation block; None where not measured.
+    steps_per_s, eta_s: from the last seconds; 0 for a finished run that was resumed.
     warning: something that went wrong and was survived; reported once.
     """
 
@@ -52,8 +52,8 @@ class ProgressReport:
     epsilon: float
     success_rate: float | None
     success_crash_free: float | None
-    steps_per_s: float | None
-    eta_s: float | None
+    steps_per_s: float
+    eta_s: float
     warning: str | None = None
 
 
@@ -82,8 +82,9 @@ def train(
     """Trains until ``config.total_steps``.
 
     Args:
-        out_dir: becomes the run's directory; with ``resume``, is one already.
-        resume: continue from the newest checkpoint, bit for bit as if never stopped.
+        out_dir: becomes the run's directory; missing or empty, unless ``resume`` is set.
+        resume: where ``out_dir`` holds a run already, continue it from its newest checkpoint,
+            bit for bit as if it had never stopped.
         clock: monotonic, seconds.
         environment: makes the environment of a scenario with a number of arenas.
 
@@ -130,7 +131,8 @@ class _Trainer:
         self._saved_steps = session.counters.env_steps
         self._started_s = self._reported_s = self._block_s = clock()
         self._block_steps = session.counters.env_steps
-        self._marks: deque[tuple[float, int]] = deque()
+        self._marks = deque([(self._started_s, self._block_steps)])
+        self._warning: str | None = None
 
     def run(self) -> TrainSummary:
         session = self._session
@@ -207,27 +209,30 @@ class _Trainer:
     def _report(self, phase: Phase, warning: str | None = None) -> None:
         session, now = self._session, self._clock()
         self._reported_s = now
+        self._warning = warning or self._warning
         steps, total = session.counters.env_steps, session.config.total_steps
         self._marks.append((now, steps))
         while now - self._marks[0][0] > SPEED_WINDOW_S and len(self._marks) > 2:
             self._marks.popleft()
-        (since_s, since_steps), speed = self._marks[0], None
-        if now > since_s and steps > since_steps:
-            speed = (steps - since_steps) / (now - since_s)
-        self._progress(
-            ProgressReport(
-                phase=phase,
-                env_steps=steps,
-                total_steps=total,
-                alpha=session.coach.rate,
-                epsilon=session.config.epsilon(steps),
-                success_rate=_number(self._last_block.get("success_rate")),
-                success_crash_free=_number(self._last_block.get("success_crash_free")),
-                steps_per_s=speed,
-                eta_s=max(0, total - steps) / speed if speed else None,
-                warning=warning,
-            )
+        since_s, since_steps = self._marks[0]
+        moving = now > since_s and steps > since_steps
+        if not moving and not session.finished:
+            return
+        speed = (steps - since_steps) / (now - since_s) if moving else 0.0
+        report = ProgressReport(
+            phase=phase,
+            env_steps=steps,
+            total_steps=total,
+            alpha=session.coach.rate,
+            epsilon=session.config.epsilon(steps),
+            success_rate=_number(self._last_block.get("success_rate")),
+            success_crash_free=_number(self._last_block.get("success_crash_free")),
+            steps_per_s=speed,
+            eta_s=max(0, total - steps) / speed if moving else 0.0,
+            warning=self._warning,
         )
+        self._warning = None
+        self._progress(report)
 
     def _summary(self) -> TrainSummary:
         session, done = self._session, self._session.counters

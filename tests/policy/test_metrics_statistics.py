@@ -1,0 +1,151 @@
+"""Intervals against published and brute-force values; the log file that survives a kill."""
+
+from __future__ import annotations
+
+import json
+import resource
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from policy_pkg.train.metrics import JsonLines, Means
+from policy_pkg.train.statistics import (
+    binomial_weights,
+    bootstrap_interquartile_mean,
+    interquartile_mean,
+    reweighted_success,
+    wilson,
+)
+from sim_pkg.contract import UserError
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "low", "high"),
+    [  # Newcombe 1998, table I, method 3
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    ],
+)
+def test_wilson_gives_the_published_intervals(
+    successes: int, trials: int, low: float, high: float
+) -> None:
+    estimate = wilson(successes, trials)
+    assert (estimate.low, estimate.high) == (
+        pytest.approx(low, abs=5e-5),
+        pytest.approx(high, abs=5e-5),
+    )
+    mirrored = wilson(trials - successes, trials)
+    assert mirrored.low == pytest.approx(1 - estimate.high)
+
+
+@pytest.mark.parametrize(("successes", "trials"), [(1, 0), (-1, 4), (5, 4)])
+def test_wilson_refuses_impossible_counts(successes: int, trials: int) -> None:
+    with pytest.raises(ValueError, match="successes of"):
+        wilson(successes, trials)
+
+
+def test_reweighting_is_the_mixture_of_the_strata() -> None:
+    rate, n = 0.1, 3
+    exact = {0: (128, 128), 1: (64, 128), 2: (0, 128), 3: (0, 128)}
+    estimate = reweighted_success(exact, n, rate)
+    assert estimate.value == pytest.approx(0.9**3 + 0.5 * 3 * 0.1 * 0.81)
+    assert estimate.low < estimate.value < estimate.high
+    # Far narrower than 128 draws at that rate.
+    drawn = wilson(round(estimate.value * 128), 128)
+    assert estimate.high - estimate.low < 0.5 * (drawn.high - drawn.low)
+    assert sum(binomial_weights(n, rate)) == pytest.approx(1.0)
+
+
+def test_reweighting_covers_the_truth_as_often_as_promised() -> None:
+    rng = np.random.default_rng(0)
+    truth = {0: 0.97, 1: 0.6, 2: 0.05}
+    n, rate, episodes = 2, 0.2, 64
+    value = sum(w * truth[k] for k, w in enumerate(binomial_weights(n, rate)))
+    hits = 0
+    for _ in range(2000):
+        exact = {k: (int(rng.binomial(episodes, p)), episodes) for k, p in truth.items()}
+        estimate = reweighted_success(exact, n, rate)
+        hits += estimate.low <= value <= estimate.high
+    assert 0.93 <= hits / 2000 <= 0.98
+
+
+def test_an_unmeasured_stratum_widens_only_the_upper_bound() -> None:
+    whole = reweighted_success({0: (50, 50), 1: (50, 50), 2: (0, 50)}, 2, 0.3)
+    part = reweighted_success({0: (50, 50), 1: (50, 50)}, 2, 0.3)
+    assert part.value == pytest.approx(whole.value)
+    assert part.high >= part.value + 0.09
+    with pytest.raises(ValueError, match=r"crash rate 1\.5"):
+        reweighted_success({0: (1, 1)}, 2, 1.5)
+    with pytest.raises(ValueError, match=r"\[5\] crashed of 2"):
+        reweighted_success({5: (1, 1)}, 2, 0.1)
+
+
+def test_interquartile_mean() -> None:
+    assert interquartile_mean(np.array([100.0, 1, 2, 3, 4, 5, 6, -90])) == pytest.approx(3.5)
+    assert interquartile_mean(np.array([0.0, 1, 2, 3, 99])) == pytest.approx(
+        (0.75 + 2 + 2.25) / 2.5
+    )
+    assert interquartile_mean(np.array([7.0])) == 7.0
+
+
+def test_bootstrap_interval_covers_and_is_repeatable() -> None:
+    scores = np.random.default_rng(0).normal(10, 1, size=(8, 3))
+    first, second = (
+        bootstrap_interquartile_mean(scores, np.random.default_rng(1), 500) for _ in range(2)
+    )
+    assert first == second
+    assert first.low < first.value < first.high
+    assert first.high - first.low < 2
+
+
+def test_means_are_of_what_was_added_and_start_anew() -> None:
+    means = Means()
+    means.add({"a": 1.0, "b": 5.0})
+    means.add({"a": 2.0})
+    restored = Means()
+    restored.load_state_dict(json.loads(json.dumps(means.state_dict())))
+    for either in (means, restored):
+        assert either.take(("a", "b", "c")) == {"a": 1.5, "b": 5.0, "c": None}
+        assert either.take(("a",)) == {"a": None}
+
+
+def test_lines_behind_the_checkpoint_are_cut_off(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    log = JsonLines(path, 0)
+    log.append({"step": 1})
+    kept = log.sync()
+    log.append({"step": 2, "loss": None})
+    log.flush()
+    log.close()
+    resumed = JsonLines(path, kept)
+    resumed.append({"step": 3})
+    resumed.flush()
+    resumed.close()
+    assert [json.loads(line)["step"] for line in path.read_text().splitlines()] == [1, 3]
+    with pytest.raises(
+        UserError, match=r"metrics\.jsonl has 24 bytes, the checkpoint knows of 900"
+    ):
+        JsonLines(path, 900)
+
+
+def test_a_refused_line_is_written_later_and_never_in_part(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    log = JsonLines(path, 0)
+    log.append({"step": 1})
+    log.flush()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20, hard))  # a disk with 20 bytes
+    try:
+        log.append({"step": 2})
+        with pytest.raises(OSError, match="too large"):
+            log.flush()
+        assert path.read_text() == '{"step": 1}\n'
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    log.append({"step": 3})
+    assert log.sync() == path.stat().st_size
+    log.close()
+    assert [json.loads(line)["step"] for line in path.read_text().splitlines()] == [1, 2, 3]
