@@ -9,12 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from crash_coach_pkg.config import CoachConfig
-from policy_pkg.checkpoint import PolicyBundle, load_policy
-from policy_pkg.train.evaluate import Condition, Evaluation
-from policy_pkg.train.evaluate import evaluate as evaluate_in_core
-from pydantic import ValidationError
-from sim_pkg.trajectory import combine
 
 from crash_coach_bringup.cli.output import (
     CliError,
@@ -24,6 +18,17 @@ from crash_coach_bringup.cli.output import (
     table,
     write_json,
 )
+from policy_pkg.checkpoint import PolicyBundle, load_policy
+from policy_pkg.train.evaluate import (
+    Condition,
+    Evaluation,
+    at_rate,
+    crash_free,
+    exactly,
+    named,
+)
+from policy_pkg.train.evaluate import evaluate as evaluate_in_core
+from sim_pkg.trajectory import combine
 
 
 class CrashMode(StrEnum):
@@ -43,15 +48,6 @@ class Layout(StrEnum):
     single = "single"
 
 
-def crash_config(option: str, **settings: Any) -> CoachConfig:
-    """A CoachConfig from one option's value, its errors told as that option's."""
-    try:
-        return CoachConfig(**settings)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise CliError(f"{option} {first['input']}: {first['msg']}") from None
-
-
 def conditions(
     robots: tuple[str, ...],
     rates: list[float],
@@ -59,29 +55,25 @@ def conditions(
     victims: list[str],
     mode: CrashMode,
 ) -> list[Condition]:
-    """What to evaluate under, in the order rates, counts, victims; crash-free without any."""
-    out = []
+    """What to evaluate under, in the order rates, counts, victims; crash-free without any.
+
+    Raises:
+        CliError: names the option, its value and what would be right.
+    """
     for rate in rates:
-        crash = crash_config(
-            "--crash-rate", strategy="fixed", crash_rate=rate, resample=False, crash_mode=mode.value
-        )
-        out.append(Condition(f"crash rate {rate:g}", crash))
+        if not 0 <= rate <= 1:
+            raise CliError(f"--crash-rate {rate}: a probability from 0 to 1 is needed")
     for count in crashed:
         if not 0 <= count <= len(robots):
             raise CliError(f"--crashed {count}: the team has {len(robots)} robots")
-        crash = crash_config(
-            "--crashed", strategy="fixed", crashed_exactly=count, crash_mode=mode.value
-        )
-        out.append(Condition(f"{count} crashed", crash))
+    for name in victims:
+        if name not in robots:
+            raise CliError(f"--victims {name}: unknown robot; one of: {', '.join(robots)}")
+    out = [at_rate(rate, mode.value) for rate in rates]
+    out += [exactly(count, mode.value) for count in crashed]
     if victims:
-        for name in victims:
-            if name not in robots:
-                raise CliError(f"--victims {name}: unknown robot; one of: {', '.join(robots)}")
-        crash = crash_config(
-            "--victims", strategy="fixed", victims=tuple(victims), crash_mode=mode.value
-        )
-        out.append(Condition(f"{', '.join(victims)} crashed", crash))
-    return out or [Condition("crash-free", CoachConfig(strategy="none"))]
+        out.append(named(list(dict.fromkeys(victims)), mode.value))
+    return out or [crash_free()]
 
 
 def evaluator(
@@ -154,7 +146,9 @@ def evaluate(
         Layout,
         typer.Option(help="With ROS: a process per node, one for the team, or a single process."),
     ] = Layout.nodes,
-    seed: Annotated[int, typer.Option(help="Seed of episodes, victims, random actions.", min=0)] = 0,
+    seed: Annotated[
+        int, typer.Option(help="Seed of episodes, victims, random actions.", min=0)
+    ] = 0,
     json: Annotated[Path | None, typer.Option(help="Also write the result to this file.")] = None,
 ) -> None:
     """Evaluates a trained team greedily; without a crash option, crash-free."""

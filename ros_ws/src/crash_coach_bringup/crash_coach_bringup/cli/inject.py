@@ -42,12 +42,12 @@ def inject(
     from crash_coach_bringup.ros import inject as client
 
     if clear:
-        done = client.clear(timeout_s)
-        console.print(done)
-        write_json(json, {"cleared": True})
+        answer = client.clear(timeout_s)
+        console.print(answer)
+        write_json(json, {"cleared": True, "answer": answer})
         return
     result = client.inject(
-        tuple(victims or ()), mode.value, apply_at.value, duration_steps, timeout_s=timeout_s
+        victims or [], mode.value, apply_at.value, duration_steps, timeout_s=timeout_s
     )
-    console.print(f"{mode} {', '.join(victims or ())}: {result}")
+    console.print(str(result))
     write_json(json, asdict(result))

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
-from sim_pkg.contract import UserError
 
 from crash_coach_bringup.cli.output import console
+from sim_pkg.contract import UserError
 
 if TYPE_CHECKING:
     from multiprocessing.process import BaseProcess
@@ -77,12 +77,13 @@ def _progress_bars() -> Progress:
 
 def _figures(report: Any) -> str:
     """One line of a ProgressReport."""
-    success = "-" if report.success_rate is None else f"{report.success_rate:.2f}"
-    minutes, seconds = divmod(int(report.eta_s), 60)
-    return (
-        f"alpha {report.alpha:.3f}  success {success}  "
-        f"{report.steps_per_s:,.0f} steps/s  left {minutes}:{seconds:02d}"
-    )
+    parts = [f"alpha {report.alpha:.3f}"]
+    if report.success_rate is not None:
+        parts.append(f"success {report.success_rate:.2f}")
+    if report.steps_per_s is not None and report.eta_s is not None:
+        minutes, seconds = divmod(int(report.eta_s), 60)
+        parts += [f"{report.steps_per_s:,.0f} steps/s", f"left {minutes}:{seconds:02d}"]
+    return "  ".join(parts)
 
 
 class _Runner:
@@ -115,6 +116,8 @@ class _Runner:
         task = self.tasks[message.job]
         if message.kind == "progress":
             report = message.content
+            if report.warning:
+                console.print(f"[yellow]{self.jobs[message.job].name}: {report.warning}[/yellow]")
             self.bars.update(task, completed=report.env_steps / report.total_steps)
             self.bars.update(task, figures=_figures(report))
             return

@@ -6,9 +6,9 @@ import os
 import sys
 
 import typer
-from sim_pkg.contract import UserError
 
 from crash_coach_bringup.cli import demo, doctor, evaluate, inject, train, up
+from sim_pkg.contract import UserError
 
 # Options that take several values, up to the next option: --crashed 0 1 2
 SEVERAL = {"--crash-rate", "--crashed", "--victims", "--set", "--seed"}

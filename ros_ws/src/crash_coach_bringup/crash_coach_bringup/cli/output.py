@@ -10,6 +10,7 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table
+
 from sim_pkg.contract import UserError
 
 console = Console()

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from policy_pkg.train.config import load_train_config
 
 from crash_coach_bringup.cli.jobs import Job, run_jobs
 from crash_coach_bringup.cli.output import CliError, console
+from policy_pkg.train.config import load_train_config
 
 
 def plan_jobs(

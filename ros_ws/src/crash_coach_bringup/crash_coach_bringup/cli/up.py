@@ -4,14 +4,23 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from crash_coach_bringup.ros.supervisor import Event
 
 
 class Mode(StrEnum):
     lockstep = "lockstep"
     realtime = "realtime"
+
+
+def show(event: Event) -> None:
+    """One line per event; a death goes to stderr with the end of the node's log."""
+    words = [word for word in (event.kind, event.process, event.text) if word]
+    typer.echo(f"up: {': '.join(words)}", err=event.kind == "died")
 
 
 def up(
@@ -28,15 +37,16 @@ def up(
     logs: Annotated[Path, typer.Option(help="Folder for the nodes' logs.")] = Path("runs/up"),
 ) -> None:
     """Starts sim, policies, gate and coach, one process each, until Ctrl-C or a node dies."""
-    from crash_coach_bringup.ros.supervisor import UpOptions, run_up
+    from crash_coach_bringup.ros.graph import UpOptions
+    from crash_coach_bringup.ros.up import run_up
 
     options = UpOptions(
         scenario=scenario,
         checkpoint=policy,
-        mode=mode.value,
-        team_process=team_process,
+        mode="lockstep" if mode is Mode.lockstep else "realtime",
+        layout="team" if team_process else "nodes",
         episodes=episodes,
         seed=seed,
         log_dir=logs,
     )
-    raise typer.Exit(run_up(options))
+    raise typer.Exit(run_up(options, show))

@@ -1,0 +1,162 @@
+"""The command line's own logic: options, errors as one line, results as JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+from crash_coach_bringup.cli.evaluate import CrashMode, conditions
+from crash_coach_bringup.cli.main import repeat_options
+from crash_coach_bringup.cli.output import CliError, check_json_target, write_json
+from crash_coach_bringup.cli.train import plan_jobs
+from crash_coach_bringup.ros.probe import find_executable
+from policy_pkg.untrained import write_untrained
+from sim_pkg.env import make_env
+
+ROBOTS = ("robot_1", "robot_2")
+
+
+def crash_coach(*arguments: str, env: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
+    """Runs the installed command."""
+    command = [str(find_executable("crash_coach_bringup", "crash-coach")), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=90, env=env)
+
+
+def refused(*arguments: str) -> str:
+    """The one line with which the command refuses; no traceback, exit code 1 or 2."""
+    done = crash_coach(*arguments)
+    assert done.returncode in (1, 2), done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stderr
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("policy") / "step_000000000"
+    write_untrained(path, make_env("buttons", 1).spec, seed=1)
+    return path
+
+
+def test_options_take_several_values() -> None:
+    given = ["evaluate", "run", "--crashed", "0", "1", "2", "--mode", "stay", "--json", "x"]
+    expected = [
+        *("evaluate", "run", "--crashed", "0", "--crashed", "1", "--crashed", "2"),
+        *("--mode", "stay", "--json", "x"),
+    ]
+    assert repeat_options(given) == expected
+
+
+def test_negative_values_are_values() -> None:
+    assert repeat_options(["--seed", "1", "-2"]) == ["--seed", "1", "--seed", "-2"]
+
+
+def test_conditions_in_order() -> None:
+    found = conditions(ROBOTS, [0.05], [0, 1], ["robot_2"], CrashMode.random)
+    assert [c.crash.crash_rate for c in found] == [0.05, 0.0, 0.0, 0.0]
+    assert [c.crash.crashed_exactly for c in found] == [-1, 0, 1, -1]
+    assert found[3].crash.victims == ("robot_2",)
+    assert {c.crash.crash_mode for c in found} == {"random"}
+
+
+def test_without_a_crash_option_it_is_crash_free() -> None:
+    (found,) = conditions(ROBOTS, [], [], [], CrashMode.stay)
+    assert found.crash.strategy == "none"
+
+
+@pytest.mark.parametrize(
+    ("rates", "crashed", "victims", "names"),
+    [
+        ([float("nan")], [], [], "--crash-rate nan"),
+        ([1.5], [], [], "--crash-rate 1.5"),
+        ([], [3], [], "--crashed 3"),
+        ([], [-1], [], "--crashed -1"),
+        ([], [], ["robot_9"], "robot_9"),
+    ],
+)
+def test_wrong_conditions_are_named(
+    rates: list[float], crashed: list[int], victims: list[str], names: str
+) -> None:
+    with pytest.raises(CliError, match=names):
+        conditions(ROBOTS, rates, crashed, victims, CrashMode.stay)
+
+
+def test_several_runs_get_folders_of_their_own(tmp_path: Path) -> None:
+    jobs = plan_jobs(["buttons/qmix", "buttons/adaptive"], tmp_path, [], [1, 2], False)
+    folders = [job.out_dir.relative_to(tmp_path).name for job in jobs]
+    assert folders == ["qmix-s1", "qmix-s2", "adaptive-s1", "adaptive-s2"]
+    (one,) = plan_jobs(["buttons/qmix"], tmp_path, ["total_steps=5"], [7], False)
+    assert (one.out_dir, one.config.seed, one.config.total_steps) == (tmp_path, 7, 5)
+
+
+def test_the_same_run_twice_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CliError, match="qmix-s1"):
+        plan_jobs(["buttons/qmix"], tmp_path, [], [1, 1], False)
+
+
+def test_json_is_whole_or_absent(tmp_path: Path) -> None:
+    target = tmp_path / "result.json"
+    write_json(target, {"a": 1})
+    assert json.loads(target.read_text()) == {"a": 1}
+    assert list(tmp_path.iterdir()) == [target]
+    with pytest.raises(CliError, match="missing"):
+        check_json_target(tmp_path / "missing" / "result.json")
+
+
+def test_evaluate_writes_what_it_prints(checkpoint: Path, tmp_path: Path) -> None:
+    out = tmp_path / "result.json"
+    done = crash_coach(
+        *("evaluate", str(checkpoint), "--scenario", "buttons", "--episodes", "4"),
+        *("--crashed", "0", "1", "--json", str(out)),
+    )
+    assert done.returncode == 0, done.stderr
+    result = json.loads(out.read_text())
+    assert [c["crash"]["crashed_exactly"] for c in result["conditions"]] == [0, 1]
+    assert [len(c["per_episode"]) for c in result["conditions"]] == [4, 4]
+    assert [len(e["crashed"]) for e in result["conditions"][1]["per_episode"]] == [1] * 4
+    assert result["trajectory_hash"] in done.stdout
+
+
+def test_bad_input_names_the_thing(checkpoint: Path, tmp_path: Path) -> None:
+    run = str(checkpoint)
+    assert "robot_9" in refused("evaluate", run, "--victims", "robot_9")
+    assert "nan" in refused("evaluate", run, "--crash-rate", "nan")
+    assert "buttonz" in refused("evaluate", run, "--scenario", "buttonz")
+    assert "nowhere" in refused("evaluate", str(tmp_path / "nowhere"))
+    assert "robots" in refused("evaluate", run, "--scenario", "buttons_8")
+
+
+def test_misspelt_key_writes_nothing(tmp_path: Path) -> None:
+    text = refused("train", "buttons/qmix", "--out", str(tmp_path / "run"), "--set", "gama=0.9")
+    assert "gama" in text
+    assert not (tmp_path / "run").exists()
+
+
+def test_inject_needs_exactly_one_intention() -> None:
+    assert "--victims" in refused("inject")
+    assert "--clear" in refused("inject", "--clear", "--victims", "robot_1")
+
+
+def test_inject_without_a_coach_says_so(ros_env: dict[str, str]) -> None:
+    done = crash_coach("inject", "--victims", "robot_1", "--timeout-s", "1", env=ros_env)
+    assert done.returncode == 1
+    assert "coach" in done.stderr
+    assert ros_env["ROS_DOMAIN_ID"] in done.stderr
+
+
+def test_doctor_finds_this_machine_fit(ros_env: dict[str, str], tmp_path: Path) -> None:
+    out = tmp_path / "doctor.json"
+    done = crash_coach("doctor", "--json", str(out), env=ros_env)
+    findings = {row["check"]: row for row in json.loads(out.read_text())["findings"]}
+    assert done.returncode == 0, done.stdout
+    assert {"Python", "torch", "messages", "executables", "DDS on this machine"} <= set(findings)
+
+
+def test_doctor_names_what_is_missing(tmp_path: Path) -> None:
+    broken = {**os.environ, "AMENT_PREFIX_PATH": str(tmp_path)}
+    done = crash_coach("doctor", env=broken)
+    assert done.returncode == 1
+    assert "MISSING" in done.stdout
+    assert "make setup" in done.stdout
