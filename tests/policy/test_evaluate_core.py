@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -116,10 +118,8 @@ def test_summary_counts(policy: RecurrentPolicy) -> None:
     assert isinstance(run, Evaluation)
 
 
-def test_a_policy_of_another_team_is_refused(
-    policy: RecurrentPolicy, spec: EnvSpec, tmp_path
-) -> None:  # type: ignore[no-untyped-def]
-    bundle = PolicyBundle(policy, "skirmish", ("robot_1",), 4, 2, tmp_path / "run")
+def test_a_policy_of_another_team_is_refused(policy: RecurrentPolicy) -> None:
+    bundle = PolicyBundle(policy, "skirmish", ("robot_1",), 4, 2, Path("run"))
     with pytest.raises(CheckpointError) as caught:
         evaluate(bundle, SCENARIO, crash_free(), 1, 0)
     text = str(caught.value)

@@ -18,8 +18,8 @@ CONFIGS_DIR = Path(__file__).parent.parent / "configs"
 
 
 class TrainConfig(BaseModel):
-    """One training run. The defaults are the paper's; ``configs/train/buttons/qmix.yaml`` says
-    the same with comments."""
+    """One training run. The defaults are those of ``configs/train/buttons/qmix.yaml``, which says
+    what each key is for."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -28,7 +28,7 @@ class TrainConfig(BaseModel):
     total_steps: int = Field(2_000_000, ge=1, description="environment steps, all arenas counted")
     n_envs: int = Field(8, ge=1, le=4096, description="arenas that run side by side")
     updates_per_episode: float = Field(
-        1.0, gt=0, le=64, description="gradient steps per finished episode; credit adds up"
+        0.125, gt=0, le=64, description="gradient steps per finished episode; credit adds up"
     )
     batch_episodes: int = Field(32, ge=1, description="episodes of one gradient step")
     replay_episodes: int = Field(5_000, ge=1, description="episodes that the replay keeps")
@@ -87,7 +87,11 @@ class _Overridden(YamlTree):
         for keys, text in self.overrides.items():
             if location[: len(keys)] == keys:
                 return f"--set {text}"
-        return super().where(location)
+        # A whole section is wrong: what was overridden in it may be the reason, or not.
+        inside = [
+            text for keys, text in self.overrides.items() if keys[: len(location)] == location
+        ]
+        return " with --set ".join([super().where(location), *inside])
 
 
 def train_config_names() -> tuple[str, ...]:
