@@ -162,9 +162,11 @@ def _known_keys(model: type[BaseModel], location: _Location) -> list[str]:
     """The keys that a model accepts at ``location``."""
     kind: Any = model
     for part in location:
-        if isinstance(part, str):  # an index stays within the same annotation
-            kind = kind.model_fields[part].annotation
-        kind = _inner_model(kind)
+        # An index, or the tag of a union, stays within the same annotation.
+        if isinstance(part, str) and part in kind.model_fields:
+            kind = _inner_model(kind.model_fields[part].annotation)
+        if kind is None:
+            return []
     return sorted(kind.model_fields)
 
 

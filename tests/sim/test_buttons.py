@@ -100,8 +100,9 @@ class BatchTable:
         new = (on & ~self.touched).sum(1)
         self.touched |= on
         self.steps += 1
-        success = self.touched.all(1)
-        return np.where(new > 0, 5.0 * new, -1.0), success | (self.steps == 20), success
+        success: np.ndarray = self.touched.all(1)
+        rewards: np.ndarray = np.where(new > 0, 5.0 * new, -1.0)
+        return rewards, np.logical_or(success, self.steps == 20), success
 
     def restart(self, arenas: np.ndarray) -> None:
         self.cells[arenas] = STARTS
@@ -183,7 +184,7 @@ def test_larger_teams_follow_the_same_table(name: str, n: int, m: int) -> None:
         while any(running):
             actions = rng.integers(0, 5, (4, n)).astype(np.int32)
             result = env.step(actions)
-            for b in np.flatnonzero(running):
+            for b in np.flatnonzero(running).tolist():
                 reward, ended, _ = tables[b].step(actions[b].tolist())
                 assert cells_of(env, b) == tables[b].cells
                 assert result.reward[b] == reward

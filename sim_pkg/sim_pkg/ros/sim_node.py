@@ -22,12 +22,11 @@ from sim_pkg.env import make_env
 from sim_pkg.lockstep import Decisions
 from sim_pkg.realtime import NewestCommands
 from sim_pkg.ros import convert
+from sim_pkg.ros.sim_lock import SecondSimError, only_sim
 from sim_pkg.ros.sim_params import read_parameters
 from sim_pkg.ros.sim_topics import SimTopics
 from sim_pkg.session import Session
 
-# Long enough for participants on one machine to have found each other.
-_DISCOVERY_S = 1.0
 _POLL_S = 0.05
 _HOUSEKEEPING_S = 1.0
 _SPIN_S = 0.1
@@ -90,15 +89,8 @@ class SimNode(Node):
     # --- start ------------------------------------------------------------------------------
 
     def _poll_match(self) -> None:
-        """Starts once every robot is there and no other sim is; gives up in bounded time."""
+        """Starts once every robot is there; gives up in bounded time."""
         waited_s = time.monotonic() - self._born_s
-        others = self._topics.other_sims()
-        if others:
-            self.failure = (
-                f"another sim is on this ROS domain: {', '.join(others)}; stop it or set another "
-                "ROS_DOMAIN_ID (one that was killed is still listed for about 20 s)"
-            )
-            return
         missing = self._topics.unmatched()
         if missing and waited_s > self._params.match_timeout_s:
             text = f"after {self._params.match_timeout_s:g} s still: {'; '.join(missing)}"
@@ -106,7 +98,7 @@ class SimNode(Node):
                 self.failure = text
                 return
             self.get_logger().warning(f"{text}; starting without them")
-        elif missing or waited_s < _DISCOVERY_S:
+        elif missing:
             return
         self._match_timer.cancel()
         self._topics.refresh_listeners()
@@ -260,24 +252,29 @@ class SimNode(Node):
         return response
 
 
+def _run(stopped: list[int]) -> str | None:
+    """Spins a sim until it is done, fails (returns why) or is stopped."""
+    node = SimNode()
+    executor = EventsExecutor()
+    executor.add_node(node)
+    while not stopped and not node.done:
+        executor.spin_once(timeout_sec=_SPIN_S)
+    node.finish()
+    executor.remove_node(node)
+    node.destroy_node()
+    return node.failure
+
+
 def main() -> None:
     """Entry point of ``ros2 run sim_pkg sim``; exit code 0 at the end or on a signal, else 1."""
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     stopped: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda n, _: stopped.append(n))
-    failure: str | None = None
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
-        node = SimNode()
-        executor = EventsExecutor()
-        executor.add_node(node)
-        while not stopped and not node.done:
-            executor.spin_once(timeout_sec=_SPIN_S)
-        failure = node.failure
-        node.finish()
-        executor.remove_node(node)
-        node.destroy_node()
-    except (ConfigError, InvalidParameterException) as error:
+        with only_sim(rclpy.get_default_context().get_domain_id()):
+            failure = _run(stopped)
+    except (ConfigError, InvalidParameterException, SecondSimError) as error:
         failure = str(error)
     finally:
         rclpy.try_shutdown()

@@ -88,15 +88,6 @@ class SimTopics:
                 missing.append(f"/{robot}/command has no publisher")
         return missing
 
-    def other_sims(self) -> list[str]:
-        """Full names of other nodes that publish the episode state on this domain."""
-        mine = self._node.get_fully_qualified_name()
-        infos = self._node.get_publishers_info_by_topic(EPISODE_TOPIC)
-        names = [f"{i.node_namespace.rstrip('/')}/{i.node_name}" for i in infos]
-        if mine in names:
-            names.remove(mine)
-        return names
-
     def publish_step(self, session: Session) -> None:
         """Everything about the situation before (or at the end, after) a control step."""
         convert.set_time(self._header.stamp, session.global_step * self._period_ns)
