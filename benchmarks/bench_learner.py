@@ -1,7 +1,8 @@
 """Benchmark rows of the learner: the gradient step against a plain padded one, and the replay.
 
 Run alone: ``OMP_NUM_THREADS=1 python benchmarks/bench_learner.py``. Both learners take their
-batches of the same episodes in turn, in one process and one thread; medians.
+batches of the same episodes in turn, in one process and one thread; medians of CPU time, which
+a busy machine disturbs less.
 """
 
 from __future__ import annotations
@@ -64,11 +65,11 @@ def gradient_step_ms(sizes: Sizes, full_lengths: bool, repeats: int) -> tuple[fl
     ours_s, padded_s = [], []
     for repeat in range(repeats + 2):
         slots = rng.choice(STORED_EPISODES, BATCH_EPISODES, replace=False)
-        start = time.perf_counter()
+        start = time.process_time()
         learner.update(replay.gather(slots), episodes=0)
-        middle = time.perf_counter()
+        middle = time.process_time()
         padded.update(padded_replay, slots)
-        end = time.perf_counter()
+        end = time.process_time()
         if repeat >= 2:  # the first ones warm up
             ours_s.append(middle - start)
             padded_s.append(end - middle)

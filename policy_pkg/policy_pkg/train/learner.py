@@ -12,7 +12,7 @@ process was started with OMP_NUM_THREADS=1; the same thread count gives the same
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +28,7 @@ from policy_pkg.train.replay import Batch
 
 Arrays = dict[str, npt.NDArray[Any]]
 Scalars = dict[str, int | str]
+T = TypeVar("T")
 
 
 class DivergedError(RuntimeError):
@@ -59,8 +60,8 @@ class Learner:
         self._copied_at_episode = 0
         shapes, fan_in = _shapes(config, sizes)
         values = initial_values(shapes, fan_in, np.random.Generator(np.random.Philox(seed)))
-        self._online = FlatParameters(shapes, values, dtype, gradient=True)
-        self._target = FlatParameters(shapes, values, dtype, gradient=False)
+        self._online = FlatParameters(shapes, values, dtype)
+        self._target = FlatParameters(shapes, values, dtype)
         self._parts = {
             (net, part): _part(params.named, part)
             for net, params in (("online", self._online), ("target", self._target))
@@ -79,26 +80,24 @@ class Learner:
         Raises:
             DivergedError: loss or gradient is not finite.
         """
-        loss, metrics = self._loss(batch)
-        self._zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        grad = self._online.flat.grad
-        assert grad is not None  # made with gradient=True
-        norm = torch.linalg.vector_norm(grad)
-        values = torch.stack((loss.detach(), norm, *metrics)).tolist()
-        loss_value, norm_value, td_abs, q_taken, target = values
-        if not (math.isfinite(loss_value) and math.isfinite(norm_value)):
-            raise DivergedError(batch.copy(), loss_value, norm_value, self.updates)
-        if norm_value > self.config.grad_norm_clip:
-            grad.mul_(self.config.grad_norm_clip / (norm_value + 1e-6))
+        loss, means = self._loss(batch)
+        loss_value, td_abs, q_taken, target = torch.stack((loss.detach(), *means)).tolist()
+        norm = math.nan
+        if math.isfinite(loss_value):
+            grad = self._backward(loss)
+            norm = float(torch.linalg.vector_norm(grad))
+        if not math.isfinite(norm):
+            raise DivergedError(batch.copy(), loss_value, norm, self.updates)
+        if norm > self.config.grad_norm_clip:
+            grad.mul_(self.config.grad_norm_clip / (norm + 1e-6))
         self._optimiser.step()
         self.updates += 1
         if episodes - self._copied_at_episode >= self.config.target_update_interval_episodes:
-            self._target.flat.copy_(self._online.flat.detach())
+            self._target.flat.detach().copy_(self._online.flat.detach())
             self._copied_at_episode = episodes
         return {
             "loss": loss_value,
-            "grad_norm": norm_value,
+            "grad_norm": norm,
             "td_error_abs": td_abs,
             "q_taken_mean": q_taken,
             "target_mean": target,
@@ -107,8 +106,7 @@ class Learner:
     def loss_and_gradients(self, batch: Batch) -> tuple[float, Arrays]:
         """Loss and its gradient by parameter name (copies); changes nothing."""
         loss, _ = self._loss(batch)
-        self._zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
+        self._backward(loss)
         grads = {
             name: tensor.grad.numpy().copy()
             for name, tensor in self._online.named.items()
@@ -116,9 +114,12 @@ class Learner:
         }
         return float(loss.detach()), grads
 
-    def _zero_grad(self) -> None:
-        if self._online.flat.grad is not None:
-            self._online.flat.grad.zero_()
+    def _backward(self, loss: Tensor) -> Tensor:
+        """The gradient of all parameters, flat; its memory is that of ``flat.grad``."""
+        grad = self._online.gradient
+        grad.zero_()
+        loss.backward()  # type: ignore[no-untyped-call]
+        return grad
 
     def _loss(self, batch: Batch) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
         """The loss, and the means of |TD error|, taken value and target."""
@@ -219,12 +220,17 @@ class Learner:
                 raise ValueError(
                     f"learner state {name}: {found}; must be {array.dtype} {array.shape}"
                 )
+        moments = _part(arrays, "optimiser")
+        expected = {} if scalars["updates"] == 0 else _moments(self.config, len(self._online.flat))
+        if {name: array.shape for name, array in moments.items()} != expected:
+            raise ValueError(
+                f"learner state's optimiser arrays {sorted(moments)} do not fit "
+                f"{self.config.optimiser} over {len(self._online.flat)} parameters"
+            )
         for name, array in current.items():
             array[...] = arrays[name]
         self._optimiser.state[self._online.flat] = {
-            name.removeprefix("optimiser."): torch.from_numpy(array.copy())
-            for name, array in arrays.items()
-            if name.startswith("optimiser.")
+            name: torch.from_numpy(array.copy()) for name, array in moments.items()
         }
         self.updates = int(scalars["updates"])
         self._copied_at_episode = int(scalars["copied_at_episode"])
@@ -237,7 +243,7 @@ def _mean(values: Tensor, keep: Tensor | None) -> Tensor:
     return (values * keep).sum() / keep.sum().clamp(min=1)
 
 
-def _part(named: dict[str, Tensor], part: str) -> dict[str, Tensor]:
+def _part(named: dict[str, T], part: str) -> dict[str, T]:
     prefix = f"{part}."
     return {k.removeprefix(prefix): v for k, v in named.items() if k.startswith(prefix)}
 
@@ -251,6 +257,12 @@ def _shapes(
     shapes = {f"{part}.{k}": v for part, (named, _) in parts.items() for k, v in named.items()}
     fan_in = {f"{part}.{k}": v for part, (_, fans) in parts.items() for k, v in fans.items()}
     return shapes, fan_in
+
+
+def _moments(config: LearnerConfig, parameters: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of the state that torch's optimiser keeps from its first step on."""
+    names = ("exp_avg", "exp_avg_sq") if config.optimiser == "adam" else ("square_avg",)
+    return {"step": (), **dict.fromkeys(names, (parameters,))}
 
 
 def _optimiser(config: LearnerConfig, flat: Tensor) -> torch.optim.Optimizer:

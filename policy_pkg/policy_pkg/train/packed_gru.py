@@ -159,12 +159,15 @@ def _gate_gradients(
 ) -> None:
     rows, size = n.shape
     one = rz.dtype.type(1.0)
+    # Two short loops and not one long: the compiler vectorises only what reads few arrays.
     for i in range(rows):
         for j in range(size):
-            r, z, candidate, g = rz[i, j], rz[i, size + j], n[i, j], grad[i, j]
-            d_n = g * (one - z) * (one - candidate * candidate)
+            d_n = grad[i, j] * (one - rz[i, size + j]) * (one - n[i, j] * n[i, j])
             out[i, j] = d_n
-            out[i, size + j] = d_n * n_hidden[i, j] * r * (one - r)
-            out[i, 2 * size + j] = g * (before[i, j] - candidate) * z * (one - z)
-            out[i, 3 * size + j] = d_n * r
-            grad_before[i, j] += g * z
+            out[i, 3 * size + j] = d_n * rz[i, j]
+        for j in range(size):
+            out[i, size + j] = out[i, 3 * size + j] * n_hidden[i, j] * (one - rz[i, j])
+        for j in range(size):
+            g_z = grad[i, j] * rz[i, size + j]
+            grad_before[i, j] += g_z
+            out[i, 2 * size + j] = g_z * (before[i, j] - n[i, j]) * (one - rz[i, size + j])

@@ -37,26 +37,18 @@ def initial_values(
 
 
 class FlatParameters:
-    """Named tensors over one flat vector; with ``gradient`` they are leaves of autograd.
+    """Named tensors over one flat vector, both leaves of autograd.
 
-    ``flat.grad`` and the gradients of the named tensors are the same memory.
+    ``gradient`` is the flat gradient; ``flat.grad`` and the named tensors' gradients are views.
     """
 
-    def __init__(
-        self,
-        shapes: Shapes,
-        values: npt.NDArray[np.float64],
-        dtype: torch.dtype,
-        gradient: bool,
-    ) -> None:
+    def __init__(self, shapes: Shapes, values: npt.NDArray[np.float64], dtype: torch.dtype) -> None:
         self.flat = torch.from_numpy(values).to(dtype, copy=True)
-        if gradient:
-            self.flat.requires_grad_()
-            self.flat.grad = torch.zeros_like(self.flat)
+        self.gradient = torch.zeros_like(self.flat)
         self.named = self._views(self.flat.detach(), shapes)
-        if gradient and self.flat.grad is not None:
-            for name, view in self._views(self.flat.grad, shapes).items():
-                self.named[name].requires_grad_().grad = view
+        for name, view in self._views(self.gradient, shapes).items():
+            self.named[name].requires_grad_().grad = view
+        self.flat.requires_grad_().grad = self.gradient
 
     @staticmethod
     def _views(flat: Tensor, shapes: Shapes) -> dict[str, Tensor]:
