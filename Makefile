@@ -1,6 +1,7 @@
 # Every target sets the checkout up first; a second set-up takes under 3 s.
 SHELL := /bin/bash
 PYTHON ?=
+DEMO_OPTIONS ?=
 IN_ENV := . ./env.sh &&
 CODE := sim_pkg policy_pkg crash_coach_pkg ros_ws/src/crash_coach_bringup tests benchmarks scripts
 
@@ -22,7 +23,7 @@ test: setup ## the test suite, under 5 minutes on 2 cores
 	$(IN_ENV) pytest -m "not soak"
 
 demo: setup ## train two teams, run them as ROS graphs, crash robots, read off the cost
-	$(IN_ENV) crash-coach demo
+	$(IN_ENV) crash-coach demo $(DEMO_OPTIONS)
 
 bench: setup ## every benchmark, to runs/bench.json
 	$(IN_ENV) python -m benchmarks

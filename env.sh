@@ -8,7 +8,13 @@ if [ ! -f "$_cc_root/.venv/bin/activate" ] || [ ! -f "$_cc_root/ros_ws/install/l
     return 1
 fi
 . "$_cc_root/.venv/bin/activate"
-if [ "${ROS_DISTRO:-}" != jazzy ]; then
+if [ "${ROS_DISTRO:-}" = jazzy ]; then
+    # The distribution's own Python runs `ros2 launch`, which reads our launch files.
+    for _cc_site in "$VIRTUAL_ENV"/lib/python3.*/site-packages; do
+        export PYTHONPATH="${PYTHONPATH:+$PYTHONPATH:}$_cc_site"
+    done
+    unset _cc_site
+else
     case ":${AMENT_PREFIX_PATH:-}:" in
         *":$VIRTUAL_ENV:"*) ;;
         *) export AMENT_PREFIX_PATH="$VIRTUAL_ENV${AMENT_PREFIX_PATH:+:$AMENT_PREFIX_PATH}" ;;

@@ -8,6 +8,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+
 from crash_coach_bringup.cli.evaluate import CrashMode, conditions
 from crash_coach_bringup.cli.main import repeat_options
 from crash_coach_bringup.cli.output import CliError, check_json_target, write_json
@@ -19,7 +20,9 @@ from sim_pkg.env import make_env
 ROBOTS = ("robot_1", "robot_2")
 
 
-def crash_coach(*arguments: str, env: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
+def crash_coach(
+    *arguments: str, env: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
     """Runs the installed command."""
     command = [str(find_executable("crash_coach_bringup", "crash-coach")), *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=90, env=env)

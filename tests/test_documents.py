@@ -1,0 +1,177 @@
+"""Every command in the README is executed, in a copy of the checkout made of links.
+
+On a machine without a ROS distribution `ros2` is tests/documents/ros2. `make demo` trains for
+a few thousand steps only; its full size is what CONTRIBUTING.md asks for before a release.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from crash_coach_bringup.ros.client import graph_client
+from crash_coach_bringup.ros.domain import reserve_domain
+
+ROOT = Path(__file__).resolve().parent.parent
+SMALL_DEMO = "--episodes 2 --set total_steps=2000 test_interval_steps=1000 tensorboard=false"
+DISTRIBUTION = Path("/opt/ros/jazzy/setup.bash")
+
+
+def blocks() -> list[list[str]]:
+    """The commands of each bash block of the README, in order."""
+    found = re.findall(r"```bash\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.DOTALL)
+    return [text.strip().splitlines() for text in found]
+
+
+def block(first: str) -> list[str]:
+    """The block that begins with ``first``."""
+    (found,) = [lines for lines in blocks() if lines[0] == first]
+    return found
+
+
+def session(folder: Path, commands: list[str], env: dict[str, str]) -> subprocess.Popen[str]:
+    """A shell in which someone types the commands, stopping at the first that fails."""
+    script = "\n".join(["set -eo pipefail", *commands])
+    return subprocess.Popen(
+        ["bash", "-c", script],
+        cwd=folder,
+        env=env,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def typed(folder: Path, commands: list[str], env: dict[str, str]) -> str:
+    """Types the commands and waits; returns what was printed. They must all succeed."""
+    shell = session(folder, commands, env)
+    try:
+        output, _ = shell.communicate(timeout=100)
+    finally:
+        if shell.poll() is None:
+            os.killpg(shell.pid, signal.SIGKILL)
+    assert shell.returncode == 0, output
+    return output
+
+
+@contextmanager
+def running(folder: Path, commands: list[str], env: dict[str, str]) -> Iterator[None]:
+    """Keeps the commands running while the body runs, then stops them as Ctrl-C does."""
+    shell = session(folder, commands, env)
+    try:
+        yield
+        assert shell.poll() is None, "it ended by itself:\n" + str(shell.communicate()[0])
+        os.killpg(shell.pid, signal.SIGINT)
+        shell.communicate(timeout=30)
+    finally:
+        if shell.poll() is None:
+            os.killpg(shell.pid, signal.SIGKILL)
+
+
+def wait_for_steps(env: dict[str, str], count: int = 3) -> None:
+    """Returns when the graph on the test's domain has executed ``count`` control steps."""
+    from crash_coach_interfaces.msg import EpisodeState
+
+    seen: list[int] = []
+    with graph_client("documents", int(env["ROS_DOMAIN_ID"])) as client:
+        client.node.create_subscription(
+            EpisodeState, "/sim/episode", lambda state: seen.append(state.step), 10
+        )
+        client.until(lambda: len(seen) >= count, 60, f"{count} control steps")
+
+
+@pytest.fixture(scope="module")
+def env() -> Iterator[dict[str, str]]:
+    with reserve_domain() as domain:
+        out = {**os.environ, "ROS_DOMAIN_ID": str(domain), "DEMO_OPTIONS": SMALL_DEMO}
+        if not DISTRIBUTION.exists():
+            out["PATH"] = f"{ROOT / 'tests' / 'documents'}:{out['PATH']}"
+        yield out
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, env: dict[str, str]) -> Path:
+    """A checkout of links in which `make demo` was typed."""
+    path = tmp_path_factory.mktemp("checkout")
+    for entry in ROOT.iterdir():
+        if entry.name not in ("runs", ".git"):
+            (path / entry.name).symlink_to(entry)
+    output = typed(path, block("make demo")[:1], env)
+    assert "robot_1" in output
+    return path
+
+
+def test_the_demo_leaves_what_it_says(folder: Path) -> None:
+    demo = folder / "runs" / "demo"
+    summary = json.loads((demo / "summary.json").read_text())
+    assert set(summary["methods"]) == {"qmix", "adaptive"}
+    for method in summary["methods"].values():
+        assert len(method["conditions"]) == 3
+        assert all(c["episodes"] == 2 for c in method["conditions"])
+    assert (demo / "trajectories.png").stat().st_size > 10_000
+
+
+def test_the_test_command_is_the_gate(folder: Path, env: dict[str, str]) -> None:
+    # Executing it here would run this test again without end.
+    assert block("make demo")[1] == "make test"
+    assert "pytest" in typed(folder, ["make --dry-run test"], env)
+
+
+def test_up_inject_and_param_set(folder: Path, env: dict[str, str]) -> None:
+    up, inject = [lines for lines in blocks() if lines[0] == ". ./env.sh"]
+    assert "crash-coach up" in up[1]
+    with running(folder, up, env):
+        wait_for_steps(env)
+        typed(folder, inject, env)
+        output = typed(folder, [". ./env.sh", *block("ros2 param set /coach crash_mode mute")], env)
+        assert "fail" not in output.lower()
+        wait_for_steps(env)
+
+
+def test_train_and_evaluate(folder: Path, env: dict[str, str]) -> None:
+    output = typed(folder, [". ./env.sh", *block("crash-coach doctor")], env)
+    assert output.count("trajectory hash") == 2
+    assert (folder / "runs" / "mine.json").exists()
+
+
+def test_launch_with_a_distribution(folder: Path, env: dict[str, str]) -> None:
+    commands = block(f"source {DISTRIBUTION}")
+    if not DISTRIBUTION.exists():
+        commands = commands[1:]
+    with running(folder, commands, env):
+        wait_for_steps(env)
+
+
+def test_node_by_node(folder: Path, env: dict[str, str]) -> None:
+    commands = [line for lines in blocks() for line in lines if line.startswith("ros2 run")]
+    assert len(commands) == 4
+    with running(folder, [". ./env.sh", *(f"{line} &" for line in commands), "wait"], env):
+        wait_for_steps(env)
+
+
+def test_no_block_is_left_out() -> None:
+    firsts = [lines[0] for lines in blocks()]
+    assert firsts == [
+        "make demo",
+        ". ./env.sh",
+        ". ./env.sh",
+        "ros2 param set /coach crash_mode mute",
+        "crash-coach doctor",
+        f"source {DISTRIBUTION}",
+        'ros2 run crash_coach_pkg gate --ros-args -p robots:="[robot_1, robot_2]"',
+    ]
+
+
+def test_links_between_documents_lead_somewhere() -> None:
+    for document in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/**/*.md")]:
+        for target in re.findall(r"\]\((?!https?:)([^)#]+)", document.read_text()):
+            assert (document.parent / target).exists(), f"{document.name} links to {target}"
