@@ -26,8 +26,10 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
+from sim_pkg.config import ConfigError
 from sim_pkg.contract import BoolArray
 from sim_pkg.env import make_env
+from sim_pkg.ros.sim_node import SimNode
 from sim_pkg.trajectory import TrajectoryHash
 
 Env = dict[str, str]
@@ -281,30 +283,58 @@ def test_a_second_sim_is_refused(ros_env: Env, driver: Driver) -> None:
         assert first.poll() is None
 
 
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [
-        ({"senario": "buttons"}, "unknown parameter 'senario' (did you mean 'scenario'?)"),
-        ({"resend_after_s": ".nan"}, "parameter resend_after_s = nan"),
-        ({"mode": "fast"}, "parameter mode = 'fast'"),
-        ({"seed": -1}, "parameter seed = -1"),
-        ({"episodes": "many"}, "parameter episodes = 'many'"),
-        ({"scenario": "butons"}, "unknown scenario 'butons' (did you mean 'buttons'?)"),
-    ],
-)
-def test_bad_parameters(ros_env: Env, parameters: dict[str, object], message: str) -> None:
-    with sim(ros_env, **parameters) as process:
+def test_a_bad_start_is_one_line_and_exit_code_1(ros_env: Env) -> None:
+    with sim(ros_env, senario="buttons") as process:
         code, errors = end_of(process)
     assert code == 1
-    assert f"sim: error: {message}" in errors
+    assert errors.startswith(
+        "sim: error: unknown parameter 'senario' (did you mean 'scenario'?); known: scenario, mode"
+    )
     assert errors.count("\n") == 1
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_cleanly(ros_env: Env, driver: Driver, number: signal.Signals) -> None:
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ("resend_afters:=1.0", r"unknown parameter 'resend_afters' .*'resend_after_s'"),
+        ("resend_after_s:=.nan", "parameter resend_after_s = nan"),
+        ("mode:=fast", "parameter mode = 'fast'"),
+        ("seed:=-1", "parameter seed = -1"),
+        ("episodes:=many", "parameter episodes = 'many'"),
+        ("scenario:=butons", r"unknown scenario 'butons' \(did you mean 'buttons'\?\)"),
+    ],
+)
+def test_bad_parameters(ros_env: Env, parameters: str, message: str) -> None:
+    rclpy.init(args=["--ros-args", "-p", parameters])
+    try:
+        with pytest.raises(ConfigError, match=message):
+            SimNode()
+    finally:
+        rclpy.shutdown()
+
+
+def test_whole_numbers_do_for_seconds(ros_env: Env) -> None:
+    rclpy.init(args=["--ros-args", "-p", "resend_after_s:=1"])
+    try:
+        node = SimNode()
+        assert node.get_parameter("resend_after_s").value == 1
+        node.destroy_node()
+    finally:
+        rclpy.shutdown()
+
+
+def test_sigint_ends_it_cleanly(ros_env: Env, driver: Driver) -> None:
     with sim(ros_env) as process:
         driver.until(lambda: len(driver.states) > 2)
-        process.send_signal(number)
+        process.send_signal(signal.SIGINT)
+        code, errors = end_of(process)
+    assert (code, errors) == (0, "")
+
+
+def test_sigterm_while_it_waits_for_robots(ros_env: Env) -> None:
+    with sim(ros_env, match_timeout_s=20) as process:
+        time.sleep(2.0)
+        process.send_signal(signal.SIGTERM)
         code, errors = end_of(process)
     assert (code, errors) == (0, "")
 
