@@ -14,12 +14,14 @@ import numpy as np
 import pytest
 from crash_coach_interfaces.msg import Action, Observation
 from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message, serialize_message
 
 from crash_coach_bringup.ros.client import GraphClient, graph_client
 from crash_coach_bringup.ros.graph import Node, node_process
 from policy_pkg.act import greedy
 from policy_pkg.agent import Agent, Answer, ObservationError, Sensed
 from policy_pkg.checkpoint import PolicyBundle, load_policy
+from policy_pkg.ros.convert import bytes_from_answer, sensed_from_bytes
 from policy_pkg.untrained import write_untrained
 from sim_pkg.contract import EnvSpec, UserError
 
@@ -177,6 +179,31 @@ def test_what_the_policy_cannot_use_is_refused(
 def test_a_robot_of_another_team_is_refused(bundle: PolicyBundle) -> None:
     with pytest.raises(UserError, match=r"robot_9.*robot_1, robot_2, robot_3"):
         make_agent(bundle, ("robot_9",))
+
+
+@pytest.mark.parametrize("frame_id", ["", "m", "ma", "map", "base"])
+@pytest.mark.parametrize("sizes", [(0, 0), (1, 3), (6, 5)])
+def test_the_wire_format_is_rclpys(frame_id: str, sizes: tuple[int, int]) -> None:
+    rng = np.random.default_rng(3)
+    features = rng.normal(size=sizes[0]).astype(np.float32)
+    available = rng.integers(0, 2, sizes[1], dtype=np.uint8)
+    message = Observation(episode=2**32 - 1, step=7, last_action=-1)
+    message.header.stamp.sec, message.header.stamp.nanosec = -5, 999_999_999
+    message.header.frame_id = frame_id
+    message.features = array.array("f", features.tolist())
+    message.available_actions = array.array("B", available.tolist())
+    data = serialize_message(message)
+    sensed = sensed_from_bytes(data)
+    assert (sensed.episode, sensed.step, sensed.last_action) == (2**32 - 1, 7, -1)
+    assert np.array_equal(sensed.features, features)
+    assert np.array_equal(sensed.available, available)
+    answer = bytes_from_answer(Answer(0, sensed.episode, sensed.step, 3, sensed.stamp))
+    command = deserialize_message(answer, Action)
+    assert command == Action(header=message.header, episode=2**32 - 1, step=7, action=3)
+    with pytest.raises(UserError, match="cut short"):
+        sensed_from_bytes(data[: len(data) // 2])
+    with pytest.raises(UserError, match="0000 is not little-endian CDR"):
+        sensed_from_bytes(b"\0\0" + data[2:])
 
 
 # --- as processes ---------------------------------------------------------------------------

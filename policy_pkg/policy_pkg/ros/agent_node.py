@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import signal
 import sys
 from collections.abc import Callable
@@ -19,12 +20,11 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
-from std_msgs.msg import Header
 
 from policy_pkg.act import greedy
-from policy_pkg.agent import Agent, ObservationError
+from policy_pkg.agent import Agent
 from policy_pkg.checkpoint import CheckpointError, load_policy
-from policy_pkg.ros.convert import message_from_answer, sensed_from_message
+from policy_pkg.ros.convert import bytes_from_answer, sensed_from_bytes
 from sim_pkg.contract import UserError
 
 NEWEST = QoSProfile(depth=1)  # reliable: an observation or command replaces the one before
@@ -48,7 +48,7 @@ class AgentNode(Node):
         self.failure: UserError | None = None
         """Why the node has to end; an exception in a callback would be told with a traceback."""
         bundle = load_policy(checkpoint)
-        self.agent: Agent[Header] = Agent(
+        self.agent: Agent[bytes] = Agent(
             bundle.policy,
             bundle.robots,
             bundle.robots if robot is None else (robot,),
@@ -62,7 +62,11 @@ class AgentNode(Node):
         ]
         for index, name in enumerate(self.agent.robots):
             self.create_subscription(
-                Observation, f"/{name}/observation", partial(self._on_observation, index), NEWEST
+                Observation,
+                f"/{name}/observation",
+                partial(self._on_observation, index),
+                NEWEST,
+                raw=True,
             )
 
     def _text(self, name: str, description: str, default: str = "") -> str:
@@ -80,14 +84,14 @@ class AgentNode(Node):
             if parameter.value == "":
                 raise UserError(f"parameter {name!r} of {self.get_name()} is missing")
 
-    def _on_observation(self, robot: int, message: Observation) -> None:
+    def _on_observation(self, robot: int, message: bytes) -> None:
         try:
-            answers = self.agent.receive(robot, sensed_from_message(message))
-        except ObservationError as error:
+            answers = self.agent.receive(robot, sensed_from_bytes(message))
+        except UserError as error:
             self.failure = error
             return
         for answer in answers:
-            self._commands[answer.robot].publish(message_from_answer(answer))
+            self._commands[answer.robot].publish(bytes_from_answer(answer))
 
 
 def spin(make_node: Callable[[], AgentNode]) -> int:
@@ -104,6 +108,7 @@ def spin(make_node: Callable[[], AgentNode]) -> int:
         executor = EventsExecutor()
         node = make_node()
         executor.add_node(node)
+        gc.freeze()  # what was loaded so far stays: no collection need look at it again
         while not received:
             executor.spin_once(timeout_sec=SPIN_S)
             if node.failure is not None:
