@@ -104,7 +104,7 @@ def start(run: Path) -> subprocess.Popen[bytes]:
 
 def wait_until_lines(run: Path, count: int, process: subprocess.Popen[bytes]) -> None:
     metrics = run / "metrics.jsonl"
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 100
     while not metrics.exists() or metrics.read_bytes().count(b"\n") < count:
         assert process.poll() is None, "it ended before it could be killed"
         assert time.monotonic() < deadline
