@@ -1,0 +1,113 @@
+"""One arena as a PettingZoo ParallelEnv."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+
+from sim_pkg.contract import FloatArray
+from sim_pkg.env import make_env
+
+
+class ParallelArena(ParallelEnv[str, FloatArray, int]):
+    """A scenario with one arena.
+
+    Every robot gets the team reward. ``infos[robot]`` holds ``action_mask``, (A,) int8, for the
+    next step, and after the last one ``success``. ``reset`` starts episode 0 of a seed that is
+    given, and the next episode of the same seed otherwise.
+
+    Args:
+        scenario: a name of ``scenario_names()``, or the path of a YAML file.
+        seed: used until ``reset`` is given one.
+
+    Raises:
+        ConfigError: unknown or wrong scenario.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"name": "crash_coach_v0", "render_modes": []}
+    render_mode = None
+
+    def __init__(self, scenario: str | Path, seed: int = 0) -> None:
+        self._env = make_env(scenario, 1)
+        self._seed = seed
+        self._episode = -1
+        spec = self._env.spec
+        low, high = spec.bounds
+        self.possible_agents = list(spec.robots)
+        self.agents: list[str] = []
+        self._obs_spaces: dict[str, spaces.Space[Any]] = {
+            robot: spaces.Box(low, high, (spec.obs_size,), np.float32) for robot in spec.robots
+        }
+        self._action_spaces: dict[str, spaces.Space[Any]] = {
+            robot: spaces.Discrete(spec.n_actions) for robot in spec.robots
+        }
+        self.state_space = spaces.Box(low, high, (spec.state_size,), np.float32)
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        return self._obs_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        return self._action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, FloatArray], dict[str, dict[str, Any]]]:
+        if seed is not None:
+            self._seed, self._episode = seed, -1
+        self._episode += 1
+        self._env.reset(np.zeros(1, dtype=np.intp), self._seed, np.array([self._episode]))
+        self.agents = list(self.possible_agents)
+        return self._observations(), self._infos()
+
+    def step(
+        self, actions: dict[str, int]
+    ) -> tuple[
+        dict[str, FloatArray],
+        dict[str, float],
+        dict[str, bool],
+        dict[str, bool],
+        dict[str, dict[str, Any]],
+    ]:
+        """One control step.
+
+        Raises:
+            ValueError: an agent without an action, or an action that is not available.
+        """
+        if not self.agents:
+            return {}, {}, {}, {}, {}
+        if set(actions) != set(self.agents):
+            raise ValueError(f"actions for {sorted(actions)}; expected one for each {self.agents}")
+        joint = np.array([[actions[robot] for robot in self.agents]], dtype=np.int32)
+        result = self._env.step(joint)
+        robots = self.agents
+        terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
+        infos = self._infos()
+        if terminated or truncated:
+            for info in infos.values():
+                info["success"] = bool(result.success[0])
+        observations = self._observations()
+        rewards = dict.fromkeys(robots, float(result.reward[0]))
+        terminations = dict.fromkeys(robots, terminated)
+        truncations = dict.fromkeys(robots, truncated)
+        if terminated or truncated:
+            self.agents = []
+        return observations, rewards, terminations, truncations, infos
+
+    def state(self) -> FloatArray:
+        """(S,) the global state."""
+        return self._env.state[0].copy()
+
+    def render(self) -> None:
+        """Nothing: render.py draws whole trajectories."""
+
+    def _observations(self) -> dict[str, FloatArray]:
+        return {robot: self._env.obs[0, i].copy() for i, robot in enumerate(self.agents)}
+
+    def _infos(self) -> dict[str, dict[str, Any]]:
+        masks: npt.NDArray[np.int8] = self._env.available[0].astype(np.int8)
+        return {robot: {"action_mask": masks[i]} for i, robot in enumerate(self.agents)}
