@@ -5,8 +5,9 @@
     loss = mean of (y - Q_tot(s, a))^2 over the valid steps, those with t < T
 
 as in double Q-learning (van Hasselt et al. 2016) with QMIX's Q_tot; IQL has no mixer: each robot
-gets the team's reward and the mean runs over steps and robots. Runs on one thread where the
-process was started with OMP_NUM_THREADS=1; the same thread count gives the same bits.
+gets the team's reward and the mean runs over steps and robots. Thread counts are the process's
+business: start it with OMP_NUM_THREADS=1 and OPENBLAS_NUM_THREADS=1 (a second thread gains
+nothing here), and the same seed gives the same bits.
 """
 
 from __future__ import annotations
