@@ -29,7 +29,7 @@ os.environ.setdefault(
 ROBOTS = ("robot_1", "robot_2", "robot_3")
 N_ACTIONS = 5
 NEWEST = QoSProfile(depth=1)
-PLAN = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+PLAN = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 EPISODE = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 EVENTS = QoSProfile(depth=1000)
 Key = tuple[int, int]

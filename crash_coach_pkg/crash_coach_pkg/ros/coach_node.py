@@ -129,6 +129,7 @@ class CoachNode(Node):
         super().__init__("coach", context=context)
         self._robots = self._robot_names()
         self._values: dict[str, Value] = {}
+        self._unconfirmed = ""  # why no gate confirmed the last change that was made all the same
         for spec in parameter_specs():
             self._values[spec.name] = self.declare_parameter(
                 spec.name, _parameter_value(spec.default), _descriptor(spec)
@@ -201,8 +202,8 @@ class CoachNode(Node):
             if answer and not disabling:
                 self.link.publish(self.link.control.restore(before))
                 return SetParametersResult(successful=False, reason=answer)
-        self._values = values
-        return SetParametersResult(successful=True, reason=answer)
+        self._values, self._unconfirmed = values, answer
+        return SetParametersResult(successful=True)
 
     def _await_gate(self, plan: CrashPlan) -> str:
         """Waits for ARMED, with ``changed`` held; returns what is wrong, or nothing."""
@@ -215,9 +216,13 @@ class CoachNode(Node):
         self, request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
         result = self.set_parameters_atomically([Parameter("enabled", value=False)])
-        response.success = bool(result.successful) and not result.reason
-        done = "every fault is cleared; enabled is now false"
-        response.message = f"{done}, but {result.reason}" if result.reason else done
+        problem = self._unconfirmed if result.successful else result.reason
+        response.success = not problem
+        response.message = (
+            f"enabled is now false, but {problem}"
+            if problem
+            else "every fault is cleared; enabled is now false"
+        )
         return response
 
 
