@@ -20,9 +20,9 @@ from crash_coach_pkg.config import check_robots
 from crash_coach_pkg.gate_state import NOTHING_APPLIED, Decision, EventKind, GateState, Outputs
 from crash_coach_pkg.plan import Mode
 from crash_coach_pkg.ros.convert import (
-    command_from_message,
+    bytes_from_decision,
+    command_from_bytes,
     effect_from_decision,
-    message_from_decision,
     message_from_event,
     plan_from_message,
 )
@@ -63,7 +63,11 @@ class GateNode(Node):
         ]
         for robot, name in enumerate(self._robots):
             self.create_subscription(
-                Action, f"/{name}/command_raw", partial(self._on_command, robot), NEWEST
+                Action,
+                f"/{name}/command_raw",
+                partial(self._on_command, robot),
+                NEWEST,
+                raw=True,
             )
         self.create_subscription(CrashPlan, "/coach/plan", self._on_plan, PLAN)
         self.create_timer(TICK_S, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -82,8 +86,13 @@ class GateNode(Node):
             raise UserError("parameter 'robots' of gate is missing: the robots' names, in order")
         return check_robots(names)
 
-    def _on_command(self, robot: int, message: Action) -> None:
-        self._send(self._state.command(command_from_message(robot, message), time.monotonic()))
+    def _on_command(self, robot: int, data: bytes) -> None:
+        try:
+            command = command_from_bytes(robot, data)
+        except UserError as error:
+            self.get_logger().error(f"{self._robots[robot]}: {error}; ignored")
+            return
+        self._send(self._state.command(command, time.monotonic()))
 
     def _on_plan(self, message: CrashPlan) -> None:
         try:
@@ -127,7 +136,7 @@ class GateNode(Node):
     def _send_decision(self, decision: Decision) -> None:
         withheld = decision.applied == NOTHING_APPLIED
         if not withheld:
-            self._commands[decision.command.robot].publish(message_from_decision(decision))
+            self._commands[decision.command.robot].publish(bytes_from_decision(decision))
         # Repeated only where the receiver has nothing else to go by: one EFFECT per robot-step.
         if withheld or (decision.mode != Mode.NONE and not decision.repeated):
             self._events.publish(effect_from_decision(decision, self._robots))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import signal
 import sys
 from collections.abc import Callable
@@ -53,6 +54,7 @@ def spin(start: Callable[[Executor], Node]) -> int:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         executor = EventsExecutor()
         node = start(executor)
+        gc.freeze()  # what was loaded so far stays: no collection need look at it again
         while not received:
             executor.spin_once(timeout_sec=SPIN_S)
     except (UserError, ParameterException, RCLError) as error:
