@@ -16,12 +16,14 @@ from typing import Any, TypeVar, get_args
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from sim_pkg.contract import UserError
+
 SCENARIOS_DIR = Path(__file__).parent / "configs" / "scenarios"
 
 _Location = tuple[int | str, ...]
 
 
-class ConfigError(ValueError):
+class ConfigError(UserError):
     """A configuration that cannot be used; the text says where, what, and what is right."""
 
 

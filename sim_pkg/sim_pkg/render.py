@@ -12,14 +12,16 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.legend_handler import HandlerPatch
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
 
 PANEL_INCHES = 4.2
 ROBOT_RADIUS = 0.36  # of a cell
-_SPREAD = 0.13  # of a cell: how far the tracks of two methods lie apart
+_SPREAD = 0.18  # of a cell: how far the tracks of two methods lie apart
 _BUTTON_COLOURS = ("#f4c95d", "#8ecae6", "#cdb4db", "#b7e4c7")
 _INK = "#333333"
+_DOTTED = (0, (1.0, 1.2))
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,7 @@ class Track:
 class TrajectoryPanel:
     """One drawing: an arena of ``arena_size_m`` (width, height) with sites and tracks.
 
-    ``grid``: draw cells of 1/10 of the width (the grid-world), with the sites as full cells.
-    ``cell_m`` overrides the side of a cell.
+    ``grid``: draw the lines between cells. ``cell_m``: side of a cell, and of a drawn site.
     """
 
     title: str
@@ -73,7 +74,10 @@ def draw_trajectories(panels: Sequence[TrajectoryPanel], path: Path) -> None:
     for ax, panel in zip(axes, panels, strict=True):
         _draw_panel(ax, panel)
     handles = _legend(panels)
-    figure.legend(handles=handles, loc="lower center", ncols=len(handles), frameon=False)
+    figure.legend(
+        handles=handles, loc="lower center", ncols=len(handles), frameon=False,
+        handler_map={Circle: HandlerPatch(patch_func=_round_key)},
+    )  # fmt: skip
     figure.subplots_adjust(left=0.02, right=0.98, top=0.92, bottom=0.11, wspace=0.05)
     _save(figure, path)
 
@@ -82,7 +86,8 @@ def _save(figure: Figure, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        FigureCanvasAgg(figure).print_png(temporary)
+        FigureCanvasAgg(figure)
+        figure.savefig(temporary, format="png")
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -120,9 +125,9 @@ def _draw_path(ax: Any, path_m: npt.NDArray[np.floating[Any]], colour: str, cell
     moving = np.linalg.norm(moves, axis=1) > 0.05 * cell_m
     if not moving.any():
         return
-    ax.plot(path_m[:, 0], path_m[:, 1], color=colour, linewidth=1.6, zorder=5, alpha=0.9)
+    ax.plot(path_m[:, 0], path_m[:, 1], color=colour, linewidth=1.6, zorder=5)
     ax.plot(*path_m[-1], marker="o", markersize=4.5, color=colour, zorder=6)
-    style = {"arrowstyle": "-|>", "color": colour, "linewidth": 0, "mutation_scale": 11}
+    style = {"arrowstyle": "-|>", "color": colour, "linewidth": 0, "mutation_scale": 12}
     for start, move in zip(path_m[:-1][moving], moves[moving], strict=True):
         ax.annotate(
             "", xy=start + 0.68 * move, xytext=start + 0.3 * move, arrowprops=style, zorder=6
@@ -136,38 +141,40 @@ def _draw_robots(ax: Any, panel: TrajectoryPanel) -> None:
     crashed = {robot for track in panel.tracks for robot in track.crashed}
     radius = ROBOT_RADIUS * panel.cell_m
     for robot, start in enumerate(panel.tracks[0].positions_m[0]):
-        style = (0, (1, 1.2)) if robot in crashed else "-"
-        ax.add_patch(
-            Circle(
-                tuple(start), radius, facecolor="white", edgecolor=_INK, linewidth=1.8,
-                linestyle=style, zorder=4,
-            )
-        )  # fmt: skip
+        ax.add_patch(_ring((start[0], start[1]), radius, robot in crashed))
         ax.annotate(
             str(robot + 1), start, xytext=(0, 0), textcoords="offset points", ha="center",
-            va="center", fontsize=8, color=_INK, zorder=7,
+            va="center", fontsize=8, color=_INK, zorder=8,
         )  # fmt: skip
 
 
 def _legend(panels: Sequence[TrajectoryPanel]) -> list[Any]:
+    """One line per method, and what circles and coloured cells mean."""
     handles: list[Any] = []
     labels: set[str] = set()
     for track in (t for panel in panels for t in panel.tracks):
         if track.label not in labels:
             labels.add(track.label)
             handles.append(Line2D([], [], color=track.colour, linewidth=2, label=track.label))
-    ring = {"marker": "o", "markersize": 9, "linestyle": "none", "markerfacecolor": "white"}
-    handles.append(Line2D([], [], markeredgecolor=_INK, label="robot", **ring))
+    handles.append(_ring((0, 0), 1.0, crashed=False, label="robot"))
     if any(track.crashed for panel in panels for track in panel.tracks):
-        handles.append(_crashed_handle())
-    handles.append(
-        Line2D([], [], marker="s", markersize=9, linestyle="none", color=_BUTTON_COLOURS[0],
-               label="button")
-    )  # fmt: skip
+        handles.append(_ring((0, 0), 1.0, crashed=True, label="crashed robot"))
+    handles.append(Rectangle((0, 0), 1, 1, facecolor=_BUTTON_COLOURS[0], label="button"))
     return handles
 
 
-def _crashed_handle() -> Any:
-    """A dotted circle; markers cannot be dotted, so a ring of dots."""
-    return Line2D([], [], marker=r"$\u25cc$", markersize=11, linestyle="none", color=_INK,
-                  label="crashed robot")  # fmt: skip
+def _ring(centre: tuple[float, float], radius: float, crashed: bool, label: str = "") -> Circle:
+    """A robot's outline."""
+    style = _DOTTED if crashed else "-"
+    return Circle(
+        centre, radius, facecolor="white", edgecolor=_INK, linewidth=1.8, linestyle=style,
+        zorder=7, label=label,
+    )  # fmt: skip
+
+
+def _round_key(
+    legend: Any, orig_handle: Circle, xdescent: float, ydescent: float, width: float,
+    height: float, fontsize: float,
+) -> Circle:  # fmt: skip
+    """A circle for the legend, where patches are rectangles by default."""
+    return Circle(((width - xdescent) / 2, (height - ydescent) / 2), 0.75 * height)
