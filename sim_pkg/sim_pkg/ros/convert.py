@@ -1,29 +1,40 @@
 """Core types to messages: no Node, no publishing.
 
-The message objects are made once; what changes in every step is written through numpy views of
-their arrays, so a step costs no allocation and no loop over elements.
+Observations and commands, of which there is one per robot and step, stay in the form in which they
+travel: Python message objects took more than half of a step's time. Their layout is plain
+little-endian CDR (OMG DDS-RTPS 2.5, section 10; XCDR version 1); a test holds it against rclpy's
+own serialization. Other message objects are made once, and what changes in every step is written
+through numpy views of their arrays.
 """
 
 from __future__ import annotations
 
+import struct
 from array import array
+from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from builtin_interfaces.msg import Time
-from crash_coach_interfaces.msg import EpisodeState, FaultEvent, Observation
+from crash_coach_interfaces.msg import EpisodeState, FaultEvent
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point
 from nav_msgs.msg import Odometry
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from sim_pkg.contract import EnvSpec
+from sim_pkg.contract import EnvSpec, UserError
 from sim_pkg.lockstep import Health
 from sim_pkg.scenarios.base import Scene
 from sim_pkg.session import Session
 
 MAP_FRAME = "map"
+# Encapsulation (4 bytes), stamp (8), length of frame_id (4), frame_id, padding to 4, fields.
+_LITTLE_ENDIAN = b"\x00\x01"
+_HEAD = struct.Struct("<4siII")
+_COUNT = struct.Struct("<I")
+_FRAME_ID_AT = 16
+_OBSERVED = struct.Struct("<IIi")  # episode, step, last_action
+_COMMANDED = struct.Struct("<IIiB")  # episode, step, action, fault
 _NS_PER_S = 1_000_000_000
 _RED = ColorRGBA(r=0.85, g=0.15, b=0.15, a=1.0)
 _BLUE = ColorRGBA(r=0.2, g=0.4, b=0.85, a=1.0)
@@ -53,28 +64,61 @@ def is_mute(event: FaultEvent) -> bool:
     return bool(event.kind == FaultEvent.EFFECT and event.applied < 0)
 
 
+@dataclass(frozen=True, slots=True)
+class Commanded:
+    """What the sim reads of an Action."""
+
+    episode: int
+    step: int
+    action: int
+    fault: int
+
+
+def command_from_bytes(data: bytes) -> Commanded:
+    """A serialized Action.
+
+    Raises:
+        UserError: not little-endian CDR, or cut short.
+    """
+    if data[:2] != _LITTLE_ENDIAN:
+        raise UserError(f"command: encapsulation {data[:2].hex()} is not little-endian CDR")
+    try:
+        (length,) = _COUNT.unpack_from(data, _FRAME_ID_AT - _COUNT.size)
+        return Commanded(*_COMMANDED.unpack_from(data, _FRAME_ID_AT + (length + 3 & ~3)))
+    except struct.error as error:
+        raise UserError(f"command of {len(data)} bytes is cut short: {error}") from error
+
+
 class ObservationWriter:
-    """One Observation per robot, refilled for every step. All share ``header``."""
+    """One serialized Observation per robot, refilled for every step. All share ``header``."""
 
     def __init__(self, spec: EnvSpec, header: Header) -> None:
-        self.messages = [Observation(header=header) for _ in spec.robots]
-        self._features: list[npt.NDArray[np.float32]] = []
-        self._available: list[npt.NDArray[np.uint8]] = []
-        for message in self.messages:
-            message.features = array("f", bytes(4 * spec.obs_size))
-            message.available_actions = array("B", bytes(spec.n_actions))
-            self._features.append(np.frombuffer(message.features, dtype=np.float32))
-            self._available.append(np.frombuffer(message.available_actions, dtype=np.uint8))
+        self._header = header
+        self._frame_id = header.frame_id.encode() + b"\0"
+        self._padding = b"\0" * (-len(self._frame_id) % 4)
+        self._n_features = _COUNT.pack(spec.obs_size)
+        self._n_actions = _COUNT.pack(spec.n_actions)
+        self.messages: list[bytes] = [b""] * spec.n_robots
 
     def fill(self, session: Session) -> None:
+        stamp = self._header.stamp
+        head = (
+            _HEAD.pack(_LITTLE_ENDIAN, stamp.sec, stamp.nanosec, len(self._frame_id))
+            + self._frame_id
+            + self._padding
+        )
         obs, available = session.obs, session.available
-        last_actions = session.last_actions.tolist()
-        for i, message in enumerate(self.messages):
-            message.episode = session.episode
-            message.step = session.step
-            message.last_action = last_actions[i]
-            self._features[i][:] = obs[i]
-            self._available[i][:] = available[i]
+        for i, last_action in enumerate(session.last_actions.tolist()):
+            self.messages[i] = b"".join(
+                (
+                    head,
+                    _OBSERVED.pack(session.episode, session.step, last_action),
+                    self._n_features,
+                    obs[i].tobytes(),
+                    self._n_actions,
+                    available[i].tobytes(),
+                )
+            )
 
 
 class EpisodeWriter:

@@ -8,7 +8,7 @@ import time
 from enum import Enum
 
 import rclpy
-from crash_coach_interfaces.msg import Action, FaultEvent
+from crash_coach_interfaces.msg import FaultEvent
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.exceptions import InvalidParameterException
@@ -18,6 +18,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
 from sim_pkg.config import ConfigError
+from sim_pkg.contract import UserError
 from sim_pkg.env import make_env
 from sim_pkg.lockstep import Decisions
 from sim_pkg.realtime import NewestCommands
@@ -122,7 +123,12 @@ class SimNode(Node):
 
     # --- stepping ---------------------------------------------------------------------------
 
-    def _on_command(self, robot: int, message: Action) -> None:
+    def _on_command(self, robot: int, data: bytes) -> None:
+        try:
+            message = convert.command_from_bytes(data)
+        except UserError as error:
+            self._fail(f"{self._env.spec.robots[robot]}: {error}")
+            return
         if not self._lockstep:
             self._newest.command(
                 robot, message.episode, message.action, message.fault, time.monotonic()

@@ -37,7 +37,7 @@ class SimTopics:
         node: Node,
         spec: EnvSpec,
         seed: int,
-        on_command: Callable[[int, Action], None],
+        on_command: Callable[[int, bytes], None],
         on_event: Callable[[FaultEvent], None],
     ) -> None:
         self._node = node
@@ -61,7 +61,7 @@ class SimTopics:
         self._odom_pubs = [pub(Odometry, f"/{r}/odom", _reliable(10)) for r in spec.robots]
         self._command_subs = [
             node.create_subscription(
-                Action, f"/{robot}/command", partial(on_command, i), _reliable(1)
+                Action, f"/{robot}/command", partial(on_command, i), _reliable(1), raw=True
             )
             for i, robot in enumerate(spec.robots)
         ]

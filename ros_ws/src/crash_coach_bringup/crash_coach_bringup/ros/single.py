@@ -15,10 +15,10 @@ from rclpy.exceptions import ParameterException
 from rclpy.experimental import EventsExecutor
 from rclpy.signals import SignalHandlerOptions
 
-from crash_coach_pkg.ros.coach_node import CoachNode
-from crash_coach_pkg.ros.gate_node import GateNode
+from crash_coach_pkg.ros import coach_node, gate_node
 from policy_pkg.ros.team_node import TeamNode
 from sim_pkg.contract import UserError
+from sim_pkg.ros.sim_lock import SecondSimError, only_sim
 from sim_pkg.ros.sim_node import SimNode
 
 SPIN_S = 0.1  # how soon a signal is noticed
@@ -35,8 +35,9 @@ def main() -> int:
         signal.signal(number, note)
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        _run(received)
-    except (UserError, ParameterException) as error:
+        with only_sim(rclpy.get_default_context().get_domain_id()):
+            _run(received)
+    except (UserError, ParameterException, SecondSimError) as error:
         print(f"graph: error: {error}", file=sys.stderr)  # noqa: T201
         return 1
     finally:
@@ -45,11 +46,12 @@ def main() -> int:
 
 
 def _run(received: list[int]) -> None:
-    gate, coach, team, sim = GateNode(), CoachNode(), TeamNode(), SimNode()
     executor = EventsExecutor()
-    for node in (gate, coach.link, team, sim):
-        executor.add_node(node)
-    coach.start()
+    gate = gate_node.start(executor)
+    coach = coach_node.start(executor)
+    team, sim = TeamNode(), SimNode()
+    executor.add_node(team)
+    executor.add_node(sim)
     try:
         while not received and not sim.done:
             executor.spin_once(timeout_sec=SPIN_S)
@@ -59,7 +61,8 @@ def _run(received: list[int]) -> None:
             raise UserError(sim.failure)
         sim.finish()
     finally:
-        coach.destroy_node()
+        for node in (coach, gate, team, sim):
+            node.destroy_node()
 
 
 if __name__ == "__main__":

@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import signal
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-
-from rclpy.context import Context
-from rclpy.node import Node
 
 from crash_coach_bringup.ros.graph import (
     GraphError,
@@ -19,9 +15,7 @@ from crash_coach_bringup.ros.graph import (
     graph_processes,
 )
 from crash_coach_bringup.ros.supervisor import Event, Supervisor, watch
-
-DISCOVERY_S = 1.0  # how long another sim on this machine is looked for
-LOOK_S = 0.05
+from sim_pkg.ros.sim_lock import SecondSimError, only_sim
 
 
 def run_up(options: UpOptions, on_event: Callable[[Event], None]) -> int:
@@ -49,21 +43,11 @@ def run_up(options: UpOptions, on_event: Callable[[Event], None]) -> int:
 
 def refuse_second_sim(domain: int) -> None:
     """Raises GraphError where a sim already runs on the domain."""
-    context = Context()
-    context.init(args=[], domain_id=domain)
     try:
-        node = Node("crash_coach_up", context=context, use_global_arguments=False)
-        deadline = time.monotonic() + DISCOVERY_S
-        while time.monotonic() < deadline:
-            if node.count_publishers("/sim/episode"):
-                raise GraphError(
-                    f"a sim already runs on ROS domain {domain}: stop it, or set another "
-                    "ROS_DOMAIN_ID"
-                )
-            time.sleep(LOOK_S)
-        node.destroy_node()
-    finally:
-        context.try_shutdown()
+        with only_sim(domain):
+            pass  # it is free: the graph's own sim takes it
+    except SecondSimError as error:
+        raise GraphError(str(error)) from None
 
 
 @contextmanager
