@@ -207,7 +207,7 @@ def check(lockstep: bool, played: list[tuple[str, object]], by_lease: bool) -> N
     assert all(d.mode == Mode.NONE and d.applied == d.command.action for d in after)
 
 
-@settings(deadline=None, max_examples=250)
+@settings(deadline=None, max_examples=150)
 @given(lockstep=st.booleans(), played=operations, by_lease=st.booleans())
 def test_effects_equal_the_plan_and_a_clear_or_a_lapse_lets_everything_pass(
     lockstep: bool, played: list[tuple[str, object]], by_lease: bool

@@ -211,6 +211,10 @@ class Team:
             self.executor.spin_once(timeout_sec=0.02)
         return outcomes
 
+    def armed(self) -> list[int]:
+        """Revisions that the gate armed."""
+        return [event.revision for event in self.events if event.kind == FaultEvent.ARMED]
+
     def kinds(self) -> list[int]:
         """Of the events that are no EFFECT, in order."""
         return [event.kind for event in self.events if event.kind != FaultEvent.EFFECT]

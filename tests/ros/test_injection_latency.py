@@ -89,7 +89,7 @@ def test_no_injection_is_late(ros_env: dict[str, str]) -> None:
 
 
 def test_no_injection_is_late_across_episodes(ros_env: dict[str, str]) -> None:
-    run(ros_env, injections=20, length=7)
+    run(ros_env, injections=9, length=7)
 
 
 @pytest.mark.soak
