@@ -23,7 +23,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 
 # Read when a process creates its first participant; children inherit it.
 os.environ.setdefault(
-    "FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name("fastdds.xml"))
+    "FASTRTPS_DEFAULT_PROFILES_FILE",
+    str(Path(__file__).parents[2] / "ros_ws/src/crash_coach_bringup/config/fastdds.xml"),
 )
 
 ROBOTS = ("robot_1", "robot_2", "robot_3")
