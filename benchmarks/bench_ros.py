@@ -18,7 +18,13 @@ from rclpy.qos import QoSProfile
 
 from crash_coach_bringup.ros.client import GraphClient, graph_client
 from crash_coach_bringup.ros.domain import reserve_domain
-from crash_coach_bringup.ros.graph import Layout, Process, UpOptions, graph_processes
+from crash_coach_bringup.ros.graph import (
+    Layout,
+    Process,
+    UpOptions,
+    graph_environment,
+    graph_processes,
+)
 from crash_coach_bringup.ros.supervisor import Supervisor
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
@@ -79,7 +85,7 @@ def request_reply_per_s(folder: Path) -> float:
     replier = Process("replier", (sys.executable, here, "reply"))
     with (
         reserve_domain() as domain,
-        Supervisor([replier], folder, domain) as supervisor,
+        Supervisor([replier], folder, graph_environment(domain)) as supervisor,
         graph_client("pinger", domain, lambda: refuse_dead(supervisor, 0.0)) as client,
     ):
         return Pinger(client).rate()
@@ -117,7 +123,9 @@ def lockstep_steps_per_s(folder: Path, robots: int, layout: Layout, gate: bool) 
     options = UpOptions(scenario, checkpoint, layout=layout, gate=gate)
     with (
         reserve_domain() as domain,
-        Supervisor(graph_processes(options, spec.robots), folder / "logs", domain) as supervisor,
+        Supervisor(
+            graph_processes(options, spec.robots), folder / "logs", graph_environment(domain)
+        ) as supervisor,
         graph_client("meter", domain, lambda: refuse_dead(supervisor, 0.0)) as client,
     ):
         sample(client, spec.dt_s)

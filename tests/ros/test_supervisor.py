@@ -1,4 +1,4 @@
-"""The supervisor with plain processes, and the whole graph under ``up`` when a node dies."""
+"""The supervisor, with plain processes: deaths, stopping, nothing left behind."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def wait_for_end(supervisor: Supervisor) -> Ended:
 
 def test_a_death_is_told_with_code_and_the_end_of_the_log(tmp_path: Path) -> None:
     failing = "print(*range(100), sep='\\n'); print('the reason'); raise SystemExit(3)"
-    with Supervisor([python("a", SLEEP), python("b", failing)], tmp_path, 0) as supervisor:
+    with Supervisor([python("a", SLEEP), python("b", failing)], tmp_path, {}) as supervisor:
         pids = list(supervisor.pids().values())
         ended = wait_for_end(supervisor)
     assert (ended.name, ended.exit_code, ended.log) == ("b", 3, tmp_path / "b.log")
@@ -52,7 +52,7 @@ def test_a_death_is_told_with_code_and_the_end_of_the_log(tmp_path: Path) -> Non
 
 
 def test_a_killed_process_is_told_by_its_signal(tmp_path: Path) -> None:
-    with Supervisor([python("a", SLEEP)], tmp_path, 0) as supervisor:
+    with Supervisor([python("a", SLEEP)], tmp_path, {}) as supervisor:
         os.kill(supervisor.pids()["a"], signal.SIGKILL)
         ended = wait_for_end(supervisor)
     assert "a died (killed by SIGKILL" in ended.describe()
@@ -68,7 +68,7 @@ def test_stopping_asks_first_and_kills_what_does_not_listen(
     stops = ((signal.SIGINT, 0.5), (signal.SIGTERM, 0.2), (signal.SIGKILL, 5.0))
     monkeypatch.setattr("crash_coach_bringup.ros.supervisor.STOPS", stops)
     processes = [python("polite", polite), python("stubborn", STUBBORN + SLEEP)]
-    with Supervisor(processes, tmp_path, 0) as supervisor:
+    with Supervisor(processes, tmp_path, {}) as supervisor:
         pids = list(supervisor.pids().values())
         for name in ("polite", "stubborn"):
             await_text(supervisor.log_of(name), "up")
@@ -80,7 +80,7 @@ def test_a_failing_start_leaves_nothing_behind(tmp_path: Path) -> None:
     before = set(psutil.Process().children())
     processes = [python("a", SLEEP), Process("b", ("/no/such/program",))]
     with pytest.raises(FileNotFoundError, match="/no/such/program"):
-        Supervisor(processes, tmp_path, 0).__enter__()
+        Supervisor(processes, tmp_path, {}).__enter__()
     assert set(psutil.Process().children()) == before
 
 
@@ -90,7 +90,7 @@ def test_a_killed_supervisor_takes_its_processes_along(tmp_path: Path) -> None:
         "from crash_coach_bringup.ros.graph import Process;"
         "from crash_coach_bringup.ros.supervisor import Supervisor;"
         f"sleeper = Process('a', (sys.executable, '-c', {STUBBORN + SLEEP!r}));"
-        f"s = Supervisor([sleeper], Path({str(tmp_path)!r}), 0);"
+        f"s = Supervisor([sleeper], Path({str(tmp_path)!r}), {{}});"
         "s.__enter__(); print(s.pids()['a'], flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as child:
@@ -110,20 +110,20 @@ def test_a_killed_supervisor_takes_its_processes_along(tmp_path: Path) -> None:
 )
 def test_the_sim_ends_the_graph(tmp_path: Path, sim: str, code: int, kind: str) -> None:
     events: list[Event] = []
-    with Supervisor([python("a", SLEEP), python("sim", sim)], tmp_path, 0) as supervisor:
+    with Supervisor([python("a", SLEEP), python("sim", sim)], tmp_path, {}) as supervisor:
         assert watch(supervisor, ("sim",), lambda: False, events.append) == code
     assert [event.kind for event in events] == [kind]
 
 
 def test_another_process_that_ends_is_a_death_even_with_code_0(tmp_path: Path) -> None:
     events: list[Event] = []
-    with Supervisor([python("a", "pass"), python("sim", SLEEP)], tmp_path, 0) as supervisor:
+    with Supervisor([python("a", "pass"), python("sim", SLEEP)], tmp_path, {}) as supervisor:
         assert watch(supervisor, ("sim",), lambda: False, events.append) == 1
     assert [event.process for event in events] == ["a"]
 
 
 def test_an_interruption_ends_watching(tmp_path: Path) -> None:
     events: list[Event] = []
-    with Supervisor([python("sim", SLEEP)], tmp_path, 0) as supervisor:
+    with Supervisor([python("sim", SLEEP)], tmp_path, {}) as supervisor:
         assert watch(supervisor, ("sim",), lambda: True, events.append) == 130
     assert [event.kind for event in events] == ["interrupted"]

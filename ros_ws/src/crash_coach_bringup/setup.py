@@ -18,7 +18,7 @@ setup(
         (f"share/{package}", ["package.xml"]),
         (f"share/{package}/launch", glob("launch/*.launch.py")),
         (f"share/{package}/rviz", glob("rviz/*.rviz")),
-        (f"share/{package}/config", glob("config/*.yaml")),
+        (f"share/{package}/config", glob("config/*.xml")),
     ],
     install_requires=["setuptools"],
     zip_safe=False,

@@ -17,7 +17,13 @@ from std_srvs.srv import Trigger
 
 from crash_coach_bringup.ros.client import GraphClient, graph_client
 from crash_coach_bringup.ros.domain import reserve_domain
-from crash_coach_bringup.ros.graph import Layout, UpOptions, check_team, graph_processes
+from crash_coach_bringup.ros.graph import (
+    Layout,
+    UpOptions,
+    check_team,
+    graph_environment,
+    graph_processes,
+)
 from crash_coach_bringup.ros.supervisor import Supervisor
 from crash_coach_pkg.coach import Coach
 from policy_pkg.train.evaluate import Condition, EpisodeResult, Evaluation
@@ -70,7 +76,7 @@ def evaluate_via_ros(
             coach = Coach(condition.crash, robots, seed)
         except ValueError as error:
             raise UserError(f"condition {condition.name!r}: {error}") from error
-        with Supervisor(graph_processes(options, robots), logs, domain) as graph:
+        with Supervisor(graph_processes(options, robots), logs, graph_environment(domain)) as graph:
 
             def check() -> None:
                 for ended in graph.wait(0.0):

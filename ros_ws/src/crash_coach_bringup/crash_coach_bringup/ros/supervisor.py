@@ -8,7 +8,7 @@ import selectors
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -60,14 +60,12 @@ class Supervisor:
         OSError: a process cannot be started, or a log not be written.
     """
 
-    def __init__(self, processes: Sequence[Process], log_dir: Path, domain: int) -> None:
+    def __init__(
+        self, processes: Sequence[Process], log_dir: Path, environment: Mapping[str, str]
+    ) -> None:
         self._processes = tuple(processes)
         self._log_dir = log_dir
-        self._environment = {
-            **os.environ,
-            "ROS_DOMAIN_ID": str(domain),
-            "PYTHONUNBUFFERED": "1",
-        }
+        self._environment = {**os.environ, **environment, "PYTHONUNBUFFERED": "1"}
         self._running: dict[str, subprocess.Popen[bytes]] = {}
         self._selector = selectors.DefaultSelector()
 

@@ -12,6 +12,7 @@ from crash_coach_bringup.ros.graph import (
     UpOptions,
     check_team,
     domain_id,
+    graph_environment,
     graph_processes,
 )
 from crash_coach_bringup.ros.supervisor import Event, Supervisor, watch
@@ -33,7 +34,10 @@ def run_up(options: UpOptions, on_event: Callable[[Event], None]) -> int:
     domain = domain_id(options)
     processes = graph_processes(options, check_team(options))
     refuse_second_sim(domain)
-    with stop_signals() as interrupted, Supervisor(processes, options.log_dir, domain) as running:
+    with (
+        stop_signals() as interrupted,
+        Supervisor(processes, options.log_dir, graph_environment(domain)) as running,
+    ):
         for name, pid in running.pids().items():
             on_event(Event("started", name, f"process {pid}, log {running.log_of(name)}"))
         exit_code = watch(running, ("sim", "graph"), interrupted, on_event)

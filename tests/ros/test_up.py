@@ -1,0 +1,174 @@
+"""`up`: the whole graph as processes; what dies is told, and nothing is left behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from crash_coach_interfaces.msg import EpisodeState
+
+from crash_coach_bringup.ros.client import graph_client
+from crash_coach_bringup.ros.graph import GraphError, UpOptions
+from crash_coach_bringup.ros.up import run_up
+from policy_pkg.checkpoint import CheckpointError
+from policy_pkg.untrained import write_untrained
+from sim_pkg.config import ConfigError
+from sim_pkg.env import make_env
+from sim_pkg.ros.sim_lock import only_sim
+
+TOLD_WITHIN_S = 2.0
+UP = """
+import json, sys
+from pathlib import Path
+from crash_coach_bringup.ros.graph import UpOptions
+from crash_coach_bringup.ros.up import run_up
+options = json.loads(sys.argv[1])
+for key in ("checkpoint", "log_dir"):
+    options[key] = Path(options[key])
+tell = lambda event: print(json.dumps([event.kind, event.process, event.text]), flush=True)
+sys.exit(run_up(UpOptions(**options), tell))
+"""
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("team") / "step_0"
+    write_untrained(folder, make_env("buttons", 1).spec, seed=1)
+    return folder
+
+
+class Up:
+    """A running `up`, its events and the process ids of its nodes."""
+
+    def __init__(self, child: subprocess.Popen[str]) -> None:
+        self.child = child
+        self.pids: dict[str, int] = {}
+
+    def event(self) -> tuple[str, str, str]:
+        assert self.child.stdout is not None
+        kind, process, text = json.loads(self.child.stdout.readline())
+        return kind, process, text
+
+    def started(self, count: int) -> None:
+        for _ in range(count):
+            kind, process, text = self.event()
+            assert kind == "started"
+            self.pids[process] = int(text.split()[1].rstrip(","))
+
+    def left(self) -> list[int]:
+        return [pid for pid in self.pids.values() if psutil.pid_exists(pid)]
+
+
+@contextmanager
+def up(checkpoint: Path, logs: Path, env: dict[str, str], **options: Any) -> Iterator[Up]:
+    given = {"scenario": "buttons", "checkpoint": str(checkpoint), "log_dir": str(logs), **options}
+    child = subprocess.Popen(
+        [sys.executable, "-c", UP, json.dumps(given)], stdout=subprocess.PIPE, text=True, env=env
+    )
+    try:
+        yield Up(child)
+    finally:
+        if child.poll() is None:
+            child.kill()
+        child.communicate(timeout=10)
+
+
+def await_episode() -> None:
+    """Until the graph of this domain plays."""
+    states: list[EpisodeState] = []
+    with graph_client("looker") as client:
+        client.node.create_subscription(EpisodeState, "/sim/episode", states.append, 10)
+        client.until(lambda: any(s.step > 0 for s in states), 40, "a control step")
+
+
+@pytest.mark.parametrize("victim", ["coach", "gate", "sim", "policy_robot_1"])
+def test_a_node_that_is_killed_is_told_and_ends_the_graph(
+    checkpoint: Path, tmp_path: Path, ros_env: dict[str, str], victim: str
+) -> None:
+    with up(checkpoint, tmp_path, ros_env) as running:
+        running.started(5)
+        assert set(running.pids) == {"sim", "coach", "gate", "policy_robot_1", "policy_robot_2"}
+        if victim == "coach":
+            await_episode()
+        killed_s = time.monotonic()
+        os.kill(running.pids[victim], signal.SIGKILL)
+        kind, process, text = running.event()
+        told_s = time.monotonic() - killed_s
+        assert (kind, process) == ("died", victim)
+        assert f"{victim} died (killed by SIGKILL, log {tmp_path / victim}.log)" in text
+        assert told_s < TOLD_WITHIN_S
+        assert running.event()[0] == "stopped"
+        assert running.child.wait(20) == 1
+        assert running.left() == []
+
+
+def test_ctrl_c_ends_everything_without_a_trace(
+    checkpoint: Path, tmp_path: Path, ros_env: dict[str, str]
+) -> None:
+    with up(checkpoint, tmp_path, ros_env) as running:
+        running.started(5)
+        await_episode()
+        running.child.send_signal(signal.SIGINT)
+        assert [running.event()[0] for _ in range(2)] == ["interrupted", "stopped"]
+        assert running.child.wait(20) == 130
+        assert running.left() == []
+    assert [log.read_text() for log in tmp_path.glob("*.log")] == [""] * 5
+
+
+@pytest.mark.parametrize(
+    ("layout", "mode", "processes"),
+    [("team", "lockstep", 4), ("nodes", "realtime", 5), ("single", "lockstep", 1)],
+)
+def test_the_last_episode_is_a_good_end(
+    checkpoint: Path,
+    tmp_path: Path,
+    ros_env: dict[str, str],
+    layout: str,
+    mode: str,
+    processes: int,
+) -> None:
+    sim = {"real_time_factor": 20.0} if mode == "realtime" else {}
+    options = {"layout": layout, "mode": mode, "episodes": 1, "sim": sim}
+    with up(checkpoint, tmp_path, ros_env, **options) as running:
+        running.started(processes)
+        assert running.event()[0] == "finished"
+        assert running.event()[0] == "stopped"
+        assert running.child.wait(20) == 0
+        assert running.left() == []
+
+
+def test_a_domain_with_a_sim_is_refused(
+    checkpoint: Path, tmp_path: Path, ros_env: dict[str, str]
+) -> None:
+    logs = tmp_path / "logs"
+    domain = int(ros_env["ROS_DOMAIN_ID"])
+    with only_sim(domain), pytest.raises(GraphError, match=f"another sim .* ROS domain {domain}"):
+        run_up(UpOptions("buttons", checkpoint, log_dir=logs), print)
+    assert not logs.exists()
+
+
+def test_what_cannot_work_is_refused_before_anything_starts(
+    checkpoint: Path, tmp_path: Path, ros_env: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    logs = tmp_path / "logs"
+    with pytest.raises(ConfigError, match="no_such_scenario"):
+        run_up(UpOptions("no_such_scenario", checkpoint, log_dir=logs), print)
+    with pytest.raises(CheckpointError, match="does not fit scenario 'buttons_8'"):
+        run_up(UpOptions("buttons_8", checkpoint, log_dir=logs), print)
+    with pytest.raises(CheckpointError, match="no such file"):
+        run_up(UpOptions("buttons", tmp_path / "nothing", log_dir=logs), print)
+    for domain, text in (("x", "'x', not a number"), ("233", r"233 is not in 0\.\.232")):
+        monkeypatch.setenv("ROS_DOMAIN_ID", domain)
+        with pytest.raises(GraphError, match=text):
+            run_up(UpOptions("buttons", checkpoint, log_dir=logs), print)
+    assert not logs.exists()
