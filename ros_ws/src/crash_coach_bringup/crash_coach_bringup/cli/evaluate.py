@@ -162,17 +162,7 @@ def evaluate(
     summaries = as_json(results)
     trajectory_hash = combine(row["trajectory_hash"] for row in summaries)
     console.print(f"trajectory hash {trajectory_hash}", soft_wrap=True)
-    write_json(
-        json,
-        {
-            "checkpoint": str(checkpoint),
-            "scenario": name,
-            "via": via.value,
-            "layout": layout.value if via is Via.ros else None,
-            "seed": seed,
-            "episodes": episodes,
-            "mode": mode.value,
-            "trajectory_hash": trajectory_hash,
-            "conditions": summaries,
-        },
-    )
+    result: dict[str, Any] = {"checkpoint": str(checkpoint), "scenario": name, "via": via.value}
+    result["layout"] = layout.value if via is Via.ros else None
+    result |= {"seed": seed, "episodes": episodes, "mode": mode.value}
+    write_json(json, {**result, "trajectory_hash": trajectory_hash, "conditions": summaries})

@@ -29,5 +29,14 @@ def draw_first_episodes(
             episode = evaluations[index][1].episodes[0]
             assert episode.positions_m is not None  # evaluated with positions
             tracks.append(Track(label, colour, episode.positions_m, episode.crashed))
-        panels.append(TrajectoryPanel(name, scene, tracks))
+        panels.append(
+            TrajectoryPanel(
+                name,
+                scene.arena_m,
+                scene.sites_m,
+                tracks,
+                grid=scene.cell_m > 0,
+                cell_m=scene.cell_m,
+            )
+        )
     draw_trajectories(panels, path)
