@@ -39,7 +39,7 @@ def _batch(episodes: list[Episode]) -> Batch:
 
 def _learner(**settings: Any) -> Learner:
     """A float64 learner whose target nets differ from the online ones."""
-    learner = Learner(LearnerConfig(**SMALL, **settings), SIZES, seed=3, dtype=torch.float64)
+    learner = Learner(LearnerConfig(**SMALL, **settings), SIZES, seed=3, dtype=np.float64)
     for seed in range(3):
         learner.update(_batch(_episodes(100 + seed)), episodes=0)
     return learner

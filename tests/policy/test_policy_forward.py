@@ -55,12 +55,11 @@ def test_agrees_with_the_learners_agent_net_along_whole_episodes() -> None:
         replay.add(episode)
     batch = replay.gather(np.arange(len(episodes)))
     weights = Learner(LearnerConfig(), SIZES, seed=2).agent_weights()
-    tensors = {name: torch.from_numpy(array) for name, array in weights.items()}
     n = SIZES.n_robots
-    packed_rows = torch.from_numpy(batch.inputs).view(-1, SIZES.input_size)
+    packed_rows = batch.inputs.reshape(-1, SIZES.input_size)
     schedule = Schedule([int(rows) * n for rows in batch.alive])
-    learner_q = agent_net.unroll_values(tensors, packed_rows, schedule)
-    packed = learner_q.numpy().reshape(-1, n, SIZES.n_actions)
+    learner_q = agent_net.values(weights, packed_rows, schedule)
+    packed = learner_q.reshape(-1, n, SIZES.n_actions)
 
     policy = RecurrentPolicy(weights, n, SIZES.n_actions)
     robots = np.arange(n, dtype=np.int32)

@@ -107,7 +107,7 @@ def _last_actions(policy: RecurrentPolicy, cue: int, keep_hidden: bool) -> list[
 
 @pytest.mark.parametrize("algorithm", ["qmix", "vdn"])
 def test_memory_task_is_solved_by_the_recurrent_state(algorithm: str) -> None:
-    policy = _train(algorithm, MEMORY, _memory_replay(), 600)
+    policy = _train(algorithm, MEMORY, _memory_replay(), 400)
     assert [_last_actions(policy, cue, keep_hidden=True) for cue in (0, 1)] == [[0, 0], [1, 1]]
     forgetful = [_last_actions(policy, cue, keep_hidden=False) for cue in (0, 1)]
     assert forgetful[0] == forgetful[1]

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 from numba import njit
-from torch import Tensor
 
 from policy_pkg.train import packed_gru
 from policy_pkg.train.episode import Sizes
@@ -16,6 +15,7 @@ from policy_pkg.train.packed_gru import Gates, GruWeights, Schedule
 from policy_pkg.train.parameters import Shapes, linear
 
 Array = npt.NDArray[Any]
+Params = dict[str, Array]
 
 
 def shapes(sizes: Sizes, hidden: int) -> tuple[Shapes, dict[str, int]]:
@@ -32,50 +32,43 @@ def shapes(sizes: Sizes, hidden: int) -> tuple[Shapes, dict[str, int]]:
     return named, {"fc1": sizes.input_size, "rnn": hidden, "fc2": hidden}
 
 
-def unroll(params: dict[str, Tensor], inputs: Tensor, schedule: Schedule) -> Tensor:
-    """Action values (R, A) of the packed rows ``inputs`` (R, I), with gradient by autograd."""
-    q: Tensor = _Unroll.apply(inputs, schedule, *params.values())
+@dataclass(frozen=True)
+class Tape:
+    """What a forward pass leaves for the backward one, by packed row."""
+
+    inputs: Array  # (R, I)
+    schedule: Schedule
+    embedded: Array  # (R, H) after the ReLU
+    gates: Gates
+    hidden: Array  # (R, H)
+
+
+def values(params: Params, inputs: Array, schedule: Schedule) -> Array:
+    """Action values (R, A) of the packed rows ``inputs`` (R, I)."""
+    hidden, _, _ = _unroll(params, inputs, schedule, keep=False)
+    return _output(params, hidden)
+
+
+def values_and_tape(params: Params, inputs: Array, schedule: Schedule) -> tuple[Array, Tape]:
+    """As ``values``, with what ``gradients`` needs."""
+    hidden, embedded, gates = _unroll(params, inputs, schedule, keep=True)
+    return _output(params, hidden), Tape(inputs, schedule, embedded, gates, hidden)
+
+
+def _output(params: Params, hidden: Array) -> Array:
+    q: Array = hidden @ params["fc2.weight"].T
+    q += params["fc2.bias"]
     return q
 
 
-def unroll_values(params: dict[str, Tensor], inputs: Tensor, schedule: Schedule) -> Tensor:
-    """As ``unroll``, without gradient and without keeping anything for one."""
-    arrays = [param.detach().numpy() for param in params.values()]
-    hidden, _, _ = _forward(arrays, inputs.numpy(), schedule, keep=False)
-    return _values(arrays, hidden)
-
-
-def _values(params: list[Array], hidden: Array) -> Tensor:
-    q = hidden @ params[6].T
-    q += params[7]
-    return torch.from_numpy(q)
-
-
-class _Unroll(torch.autograd.Function):
-    """Whole sequences as one operation, so that autograd records nothing per time step."""
-
-    @staticmethod
-    def forward(ctx: Any, inputs: Tensor, schedule: Schedule, *params: Tensor) -> Tensor:
-        arrays = [param.numpy() for param in params]
-        hidden, embedded, gates = _forward(arrays, inputs.numpy(), schedule, keep=True)
-        # Not ctx.save_for_backward: these are numpy arrays that nothing else can change.
-        ctx.saved = (arrays, inputs.numpy(), schedule, hidden, embedded, gates)
-        return _values(arrays, hidden)
-
-    @staticmethod
-    def backward(ctx: Any, grad_q: Tensor) -> tuple[Tensor | None, ...]:
-        grads = _backward(grad_q.numpy(), *ctx.saved)
-        return (None, None, *(torch.from_numpy(grad) for grad in grads))
-
-
-def _forward(
-    params: list[Array], inputs: Array, schedule: Schedule, keep: bool
+def _unroll(
+    params: Params, inputs: Array, schedule: Schedule, keep: bool
 ) -> tuple[Array, Array, Gates]:
     """Hidden states (R, H); embedded inputs and gates of all rows, or scratch without ``keep``."""
-    fc1_w, fc1_b, w_ih, w_hh, b_ih, b_hh = params[:6]
+    w_ih, w_hh = params["rnn.weight_ih"], params["rnn.weight_hh"]
     size, dtype, most = w_hh.shape[1], w_hh.dtype, schedule.sizes[0]
-    weights = GruWeights.prepare(w_ih, w_hh, b_ih, b_hh)
-    fc1 = np.ascontiguousarray(fc1_w.T)
+    weights = GruWeights.prepare(w_ih, w_hh, params["rnn.bias_ih"], params["rnn.bias_hh"])
+    fc1 = np.ascontiguousarray(params["fc1.weight"].T)
     hidden = np.empty((schedule.rows, size), dtype)
     kept = schedule.rows if keep else most
     embedded, gates = np.empty((kept, size), dtype), Gates.empty(kept, size, dtype)
@@ -86,24 +79,20 @@ def _forward(
         place = rows if keep else slice(0, count)
         x = embedded[place]
         np.matmul(inputs[rows], fc1, out=x)
-        _bias_relu(x, fc1_b)
+        _bias_relu(x, params["fc1.bias"])
         out = hidden[rows]
         packed_gru.step(weights, x, before[:count], out, gates.of(place), scratch)
         before = out
     return hidden, embedded, gates
 
 
-def _backward(
-    grad_q: Array,
-    params: list[Array],
-    inputs: Array,
-    schedule: Schedule,
-    hidden: Array,
-    embedded: Array,
-    gates: Gates,
-) -> list[Array]:
-    """Gradients of the parameters, in their order."""
-    w_ih, w_hh, fc2_w = params[2], params[3], params[6]
+def gradients(params: Params, tape: Tape, grad_q: Array, out: Params) -> None:
+    """Backward of ``values_and_tape``: fills the parameters' gradients ``out``, by name.
+
+    grad_q: (R, A) of the loss with respect to the action values.
+    """
+    w_ih, w_hh, fc2_w = params["rnn.weight_ih"], params["rnn.weight_hh"], params["fc2.weight"]
+    schedule, hidden, embedded, gates = tape.schedule, tape.hidden, tape.embedded, tape.gates
     size, most = hidden.shape[1], schedule.sizes[0]
     w_input = np.roll(w_ih, size, 0)  # r, z, n -> n, r, z, the order of the gates' gradients
     grad_hidden = grad_q @ fc2_w
@@ -118,21 +107,20 @@ def _backward(
         before = hidden[earlier] if t else start
         previous[rows] = before
         into = grad_hidden[earlier] if t else start.copy()
-        out = grad_gates[rows]
-        packed_gru.step_back(w_hh, gates.of(rows), before, grad_hidden[rows], out, into)
-        np.matmul(out[:, : 3 * size], w_input, out=grad_embedded[rows])
+        sums = grad_gates[rows]
+        packed_gru.step_back(w_hh, gates.of(rows), before, grad_hidden[rows], sums, into)
+        np.matmul(sums[:, : 3 * size], w_input, out=grad_embedded[rows])
         _relu_back(grad_embedded[rows], embedded[rows])
-    sums = grad_gates.sum(0)
-    return [
-        (inputs.T @ grad_embedded).T,
-        grad_embedded.sum(0),
-        np.roll((embedded.T @ grad_gates[:, : 3 * size]).T, -size, 0),
-        (previous.T @ grad_gates[:, size:]).T,
-        np.roll(sums[: 3 * size], -size),
-        sums[size:],
-        grad_q.T @ hidden,
-        grad_q.sum(0),
-    ]
+    grad_w_input = (embedded.T @ grad_gates[:, : 3 * size]).T
+    bias = grad_gates.sum(0)
+    out["fc1.weight"][:] = (tape.inputs.T @ grad_embedded).T
+    out["fc1.bias"][:] = grad_embedded.sum(0)
+    out["rnn.weight_ih"][:] = np.roll(grad_w_input, -size, 0)
+    out["rnn.weight_hh"][:] = (previous.T @ grad_gates[:, size:]).T
+    out["rnn.bias_ih"][:] = np.roll(bias[: 3 * size], -size)
+    out["rnn.bias_hh"][:] = bias[size:]
+    out["fc2.weight"][:] = grad_q.T @ hidden
+    out["fc2.bias"][:] = grad_q.sum(0)
 
 
 @njit(cache=True)

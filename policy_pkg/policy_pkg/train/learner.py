@@ -4,8 +4,12 @@
     y    = r + gamma * (1 - terminated) * Q_tot(s', a*; target)
     loss = mean of (y - Q_tot(s, a))^2 over the valid steps, those with t < T
 
-as in double Q-learning (van Hasselt et al. 2016) with QMIX's Q_tot; IQL has no mixer: each robot
-gets the team's reward and the mean runs over steps and robots. Thread counts are the process's
+as in double Q-learning (van Hasselt et al. 2016) with QMIX's Q_tot; VDN's is the sum of the robots'
+values (Sunehag et al. 2018); IQL has no mixer: each robot gets the team's reward and the mean runs
+over steps and robots.
+
+The networks and their gradients are written out in numpy: at these sizes autograd's book-keeping
+costs as much as the arithmetic. torch does the optimiser's step. Thread counts are the process's
 business: start it with OMP_NUM_THREADS=1 and OPENBLAS_NUM_THREADS=1 (a second thread gains
 nothing here), and the same seed gives the same bits.
 """
@@ -13,23 +17,24 @@ nothing here), and the same seed gives the same bits.
 from __future__ import annotations
 
 import math
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor
+from numba import njit
 
 from policy_pkg.train import agent_net, mixer
 from policy_pkg.train.episode import Sizes
 from policy_pkg.train.learner_config import LearnerConfig
 from policy_pkg.train.packed_gru import Schedule
-from policy_pkg.train.parameters import FlatParameters, initial_values
+from policy_pkg.train.parameters import FlatParameters, Shapes, initial_values, part
 from policy_pkg.train.replay import Batch
+from sim_pkg.contract import stay_action
 
-Arrays = dict[str, npt.NDArray[Any]]
+Array = npt.NDArray[Any]
+Arrays = dict[str, Array]
 Scalars = dict[str, int | str]
-T = TypeVar("T")
 
 
 class DivergedError(RuntimeError):
@@ -54,22 +59,21 @@ class Learner:
         config: LearnerConfig,
         sizes: Sizes,
         seed: int,
-        dtype: torch.dtype = torch.float32,
+        dtype: npt.DTypeLike = np.float32,
     ) -> None:
-        self.config, self.sizes, self.dtype = config, sizes, dtype
+        self.config, self.sizes, self.dtype = config, sizes, np.dtype(dtype)
         self.updates = 0
         self._copied_at_episode = 0
         shapes, fan_in = _shapes(config, sizes)
         values = initial_values(shapes, fan_in, np.random.Generator(np.random.Philox(seed)))
         self._online = FlatParameters(shapes, values, dtype)
         self._target = FlatParameters(shapes, values, dtype)
-        self._parts = {
-            (net, part): _part(params.named, part)
-            for net, params in (("online", self._online), ("target", self._target))
-            for part in ("agent", "mixer")
-        }
-        self._optimiser = _optimiser(config, self._online.flat)
-        self._robot_offset = torch.arange(sizes.n_robots) * sizes.n_actions
+        self._agent, self._mixer = _parts(self._online.named)
+        self._target_agent, self._target_mixer = _parts(self._target.named)
+        self._agent_gradients, self._mixer_gradients = _parts(self._online.named_gradients)
+        self._torch_flat = torch.from_numpy(self._online.flat).requires_grad_()
+        self._torch_flat.grad = torch.from_numpy(self._online.gradient)
+        self._optimiser = _optimiser(config, self._torch_flat)
 
     def update(self, batch: Batch, *, episodes: int) -> dict[str, float]:
         """One gradient step; then the target copy when it is due.
@@ -81,115 +85,104 @@ class Learner:
         Raises:
             DivergedError: loss or gradient is not finite.
         """
-        loss, means = self._loss(batch)
-        loss_value, td_abs, q_taken, target = torch.stack((loss.detach(), *means)).tolist()
-        norm = math.nan
-        if math.isfinite(loss_value):
-            grad = self._backward(loss)
-            norm = float(torch.linalg.vector_norm(grad))
-        if not math.isfinite(norm):
-            raise DivergedError(batch.copy(), loss_value, norm, self.updates)
+        with np.errstate(invalid="ignore", over="ignore"):  # told by the check below
+            metrics = self._gradient(batch)
+        gradient = self._online.gradient
+        norm = math.sqrt(float(gradient @ gradient))
+        if not (math.isfinite(metrics["loss"]) and math.isfinite(norm)):
+            raise DivergedError(batch.copy(), metrics["loss"], norm, self.updates)
         if norm > self.config.grad_norm_clip:
-            grad.mul_(self.config.grad_norm_clip / (norm + 1e-6))
+            gradient *= self.config.grad_norm_clip / (norm + 1e-6)
         self._optimiser.step()
         self.updates += 1
         if episodes - self._copied_at_episode >= self.config.target_update_interval_episodes:
-            self._target.flat.detach().copy_(self._online.flat.detach())
+            self._target.flat[:] = self._online.flat
             self._copied_at_episode = episodes
-        return {
-            "loss": loss_value,
-            "grad_norm": norm,
-            "td_error_abs": td_abs,
-            "q_taken_mean": q_taken,
-            "target_mean": target,
-        }
+        return {**metrics, "grad_norm": norm}
 
     def loss_and_gradients(self, batch: Batch) -> tuple[float, Arrays]:
         """Loss and its gradient by parameter name (copies); changes nothing."""
-        loss, _ = self._loss(batch)
-        self._backward(loss)
-        grads = {
-            name: tensor.grad.numpy().copy()
-            for name, tensor in self._online.named.items()
-            if tensor.grad is not None
-        }
-        return float(loss.detach()), grads
+        loss = self._gradient(batch)["loss"]
+        return loss, {name: grad.copy() for name, grad in self._online.named_gradients.items()}
 
-    def _backward(self, loss: Tensor) -> Tensor:
-        """The gradient of all parameters, flat; its memory is that of ``flat.grad``."""
-        grad = self._online.gradient
-        grad.zero_()
-        loss.backward()  # type: ignore[no-untyped-call]
-        return grad
-
-    def _loss(self, batch: Batch) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
-        """The loss, and the means of |TD error|, taken value and target."""
+    def _gradient(self, batch: Batch) -> dict[str, float]:
+        """Fills the gradient of every parameter; returns loss and means."""
         n = self.sizes.n_robots
-        now, actions = torch.from_numpy(batch.now), torch.from_numpy(batch.actions)
         first = int(batch.alive[0])
         schedule = Schedule([int(rows) * n for rows in batch.alive])
-        inputs = self._tensor(batch.inputs).view(-1, self.sizes.input_size)
-        q_target = agent_net.unroll_values(self._parts["target", "agent"], inputs, schedule)
-        q = agent_net.unroll(self._parts["online", "agent"], inputs, schedule)
-        taken_index = (now * (n * self.sizes.n_actions)).unsqueeze(1) + actions + self._robot_offset
-        taken = q.view(-1).gather(0, taken_index.view(-1)).view(-1, n)
-        q_online = q.detach()
-        with torch.no_grad():
-            shape = (len(now), n, self.sizes.n_actions)
-            following = self._next_values(
-                batch, q_online[first * n :].view(shape), q_target[first * n :].view(shape)
-            )
-        reward, bootstrap = self._tensor(batch.reward), self._tensor(batch.bootstrap)
-        keep: Tensor | None = None
-        if self.config.algorithm == "iql":
-            reward, bootstrap = reward.unsqueeze(1), bootstrap.unsqueeze(1)
-            if self.config.crashed_loss == "drop":
-                keep = torch.from_numpy(batch.faults).eq(0).to(self.dtype)
+        inputs = self._cast(batch.inputs).reshape(-1, self.sizes.input_size)
+        q, tape = agent_net.values_and_tape(self._agent, inputs, schedule)
+        q_target = agent_net.values(self._target_agent, inputs, schedule)
+        rows = batch.now[:, np.newaxis] * n + np.arange(n)
+        shape = (*rows.shape, self.sizes.n_actions)
+        taken = q[rows, batch.actions]
+        following = self._next_values(
+            batch, q[first * n :].reshape(shape), q_target[first * n :].reshape(shape)
+        )
+        if self.config.algorithm == "qmix":
+            state = self._cast(batch.state)
+            value, mixed = mixer.qmix(self._mixer, taken, state[batch.now])
+            following, _ = mixer.qmix(self._target_mixer, following, state[first:])
+            metrics, grad_value = self._error(batch, value, following)
+            grad_taken = mixer.qmix_gradients(self._mixer, mixed, grad_value, self._mixer_gradients)
+        elif self.config.algorithm == "vdn":
+            metrics, grad_value = self._error(batch, taken.sum(1), following.sum(1))
+            grad_taken = np.broadcast_to(grad_value[:, np.newaxis], taken.shape)
         else:
-            state = self._tensor(batch.state)
-            taken = self._mix("online", taken, state.index_select(0, now))
-            with torch.no_grad():
-                following = self._mix("target", following, state[first:])
-        target = torch.addcmul(reward, bootstrap, following, value=self.config.gamma)
-        error = target - taken
-        means = tuple(_mean(x, keep) for x in (error.detach().abs(), taken.detach(), target))
-        return _mean(error.square(), keep), (means[0], means[1], means[2])
+            metrics, grad_taken = self._error(batch, taken, following)
+        grad_q = np.zeros_like(q)
+        grad_q[rows, batch.actions] = grad_taken
+        agent_net.gradients(self._agent, tape, grad_q, self._agent_gradients)
+        return metrics
 
-    def _next_values(self, batch: Batch, q_online: Tensor, q_target: Tensor) -> Tensor:
+    def _error(
+        self, batch: Batch, value: Array, following: Array
+    ) -> tuple[dict[str, float], Array]:
+        """Loss and means, and the gradient of ``value``: (M,) of the team, for iql (M, n)."""
+        steps = (-1,) + (1,) * (value.ndim - 1)
+        reward = self._cast(batch.reward).reshape(steps)
+        bootstrap = self._cast(batch.bootstrap).reshape(steps)
+        target = reward + self.config.gamma * bootstrap * following
+        assert target.shape == value.shape
+        error, count = target - value, value.size
+        if self.config.crashed_loss == "drop":
+            keep = batch.faults == 0
+            count = max(1, int(np.count_nonzero(keep)))
+            error, value, target = error * keep, value * keep, target * keep
+        metrics = {
+            "loss": float(np.square(error).sum()) / count,
+            "td_error_abs": float(np.abs(error).sum()) / count,
+            "q_taken_mean": float(value.sum()) / count,
+            "target_mean": float(target.sum()) / count,
+        }
+        return metrics, error * (-2.0 / count)
+
+    def _next_values(self, batch: Batch, q_online: Array, q_target: Array) -> Array:
         """(M, n) the target net's value of each robot's next action; inputs (M, n, A)."""
-        available = torch.from_numpy(batch.available_next)
-        chooser = q_online if self.config.double_q else q_target
-        best = chooser.masked_fill(~available, -math.inf).argmax(2, keepdim=True)
-        values = q_target.gather(2, best).squeeze(2)
+        available = batch.available_next
+        values = np.empty(q_target.shape[:2], self.dtype)
+        _best(q_online if self.config.double_q else q_target, q_target, available, values)
         if self.config.crashed_target == "max":
             return values
         if self.config.crashed_target == "mean":
-            weight = available.to(self.dtype)
-            crashed = (q_target * weight).sum(2) / weight.sum(2).clamp(min=1)
+            count = np.maximum(np.count_nonzero(available, axis=2), 1)
+            crashed = (q_target * available).sum(2) / count
         else:
-            stays = torch.tensor(self.sizes.stay_actions)
-            index = available[:, :, stays].to(torch.uint8).argmax(2)
-            crashed = q_target.gather(2, stays[index].unsqueeze(2)).squeeze(2)
-        return torch.where(torch.from_numpy(batch.faults) != 0, crashed, values)
+            stay = stay_action(available, self.sizes.stay_actions)
+            crashed = np.take_along_axis(q_target, stay[:, :, np.newaxis], 2)[:, :, 0]
+        return np.where(batch.faults != 0, crashed, values)
 
-    def _mix(self, net: str, q: Tensor, state: Tensor) -> Tensor:
-        if self.config.algorithm == "vdn":
-            return mixer.vdn(q)
-        return mixer.qmix(self._parts[net, "mixer"], q, state)
-
-    def _tensor(self, array: npt.NDArray[np.float32]) -> Tensor:
-        return torch.from_numpy(array).to(self.dtype)
+    def _cast(self, array: npt.NDArray[np.float32]) -> Array:
+        return array.astype(self.dtype, copy=False)
 
     def agent_weights(self) -> Arrays:
         """The online agent net by torch's names; views that follow every update."""
-        return self._online.arrays("agent.")
+        return dict(self._agent)
 
     def state_dict(self) -> tuple[Arrays, Scalars]:
         """Everything needed to go on bit for bit: arrays (copies) by name, and JSON scalars."""
-        arrays: Arrays = {}
-        for net, params in (("online", self._online), ("target", self._target)):
-            arrays.update({f"{net}.{k}": v.copy() for k, v in params.arrays().items()})
-        state = self._optimiser.state[self._online.flat]
+        arrays = {name: array.copy() for name, array in self._nets().items()}
+        state = self._optimiser.state[self._torch_flat]
         arrays.update({f"optimiser.{k}": v.numpy().copy() for k, v in state.items()})
         scalars: Scalars = {
             "algorithm": self.config.algorithm,
@@ -198,6 +191,13 @@ class Learner:
             "copied_at_episode": self._copied_at_episode,
         }
         return arrays, scalars
+
+    def _nets(self) -> Arrays:
+        return {
+            f"{net}.{name}": array
+            for net, params in (("online", self._online), ("target", self._target))
+            for name, array in params.named.items()
+        }
 
     def load_state_dict(self, arrays: Arrays, scalars: Scalars) -> None:
         """Puts back what ``state_dict`` gave.
@@ -211,52 +211,40 @@ class Learner:
                     f"learner state has {key} {scalars.get(key)}, "
                     f"this learner {getattr(self.config, key)}"
                 )
-        current: Arrays = {}
-        for net, params in (("online", self._online), ("target", self._target)):
-            current.update({f"{net}.{k}": v for k, v in params.arrays().items()})
-        for name, array in current.items():
+        for name, array in self._nets().items():
             given = arrays.get(name)
             if given is None or given.shape != array.shape or given.dtype != array.dtype:
                 found = "nothing" if given is None else f"{given.dtype} {given.shape}"
                 raise ValueError(
                     f"learner state {name}: {found}; must be {array.dtype} {array.shape}"
                 )
-        moments = _part(arrays, "optimiser")
-        expected = {} if scalars["updates"] == 0 else _moments(self.config, len(self._online.flat))
+        moments, size = part(arrays, "optimiser."), self._online.flat.size
+        expected = {} if scalars["updates"] == 0 else _moments(self.config, size)
         if {name: array.shape for name, array in moments.items()} != expected:
             raise ValueError(
                 f"learner state's optimiser arrays {sorted(moments)} do not fit "
-                f"{self.config.optimiser} over {len(self._online.flat)} parameters"
+                f"{self.config.optimiser} over {size} parameters"
             )
-        for name, array in current.items():
+        for name, array in self._nets().items():
             array[...] = arrays[name]
-        self._optimiser.state[self._online.flat] = {
+        self._optimiser.state[self._torch_flat] = {
             name: torch.from_numpy(array.copy()) for name, array in moments.items()
         }
         self.updates = int(scalars["updates"])
         self._copied_at_episode = int(scalars["copied_at_episode"])
 
 
-def _mean(values: Tensor, keep: Tensor | None) -> Tensor:
-    """Mean of all values, or of those that ``keep`` (1 or 0) marks; 0 if it marks none."""
-    if keep is None:
-        return values.mean()
-    return (values * keep).sum() / keep.sum().clamp(min=1)
+def _parts(named: Arrays) -> tuple[Arrays, Arrays]:
+    """Of the agent net and of the mixer."""
+    return part(named, "agent."), part(named, "mixer.")
 
 
-def _part(named: dict[str, T], part: str) -> dict[str, T]:
-    prefix = f"{part}."
-    return {k.removeprefix(prefix): v for k, v in named.items() if k.startswith(prefix)}
-
-
-def _shapes(
-    config: LearnerConfig, sizes: Sizes
-) -> tuple[dict[str, tuple[int, ...]], dict[str, int]]:
+def _shapes(config: LearnerConfig, sizes: Sizes) -> tuple[Shapes, dict[str, int]]:
     parts = {"agent": agent_net.shapes(sizes, config.hidden)}
     if config.algorithm == "qmix":
         parts["mixer"] = mixer.qmix_shapes(sizes, config.mixing_hidden, config.hypernet_hidden)
-    shapes = {f"{part}.{k}": v for part, (named, _) in parts.items() for k, v in named.items()}
-    fan_in = {f"{part}.{k}": v for part, (_, fans) in parts.items() for k, v in fans.items()}
+    shapes = {f"{net}.{k}": v for net, (named, _) in parts.items() for k, v in named.items()}
+    fan_in = {f"{net}.{k}": v for net, (_, fans) in parts.items() for k, v in fans.items()}
     return shapes, fan_in
 
 
@@ -266,7 +254,22 @@ def _moments(config: LearnerConfig, parameters: int) -> dict[str, tuple[int, ...
     return {"step": (), **dict.fromkeys(names, (parameters,))}
 
 
-def _optimiser(config: LearnerConfig, flat: Tensor) -> torch.optim.Optimizer:
+def _optimiser(config: LearnerConfig, flat: torch.Tensor) -> torch.optim.Optimizer:
     if config.optimiser == "adam":
         return torch.optim.Adam([flat], lr=config.lr, eps=config.optim_eps)
     return torch.optim.RMSprop([flat], lr=config.lr, alpha=config.optim_alpha, eps=config.optim_eps)
+
+
+@njit(cache=True)
+def _best(chooser: Array, values: Array, available: Array, out: Array) -> None:
+    """out = values at the available action of the highest ``chooser``; the first of equals."""
+    steps, robots, actions = values.shape
+    for m in range(steps):
+        for robot in range(robots):
+            best = -1
+            for a in range(actions):
+                if available[m, robot, a] and (
+                    best < 0 or chooser[m, robot, a] > chooser[m, robot, best]
+                ):
+                    best = a
+            out[m, robot] = values[m, robot, max(best, 0)]

@@ -1,4 +1,4 @@
-"""Mixers: robots' action values to the team's. QMIX (Rashid et al. 2018, section 4.1), VDN."""
+"""The QMIX mixer: robots' action values to the team's (Rashid et al. 2018, section 4.1)."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 from numba import njit
-from torch import Tensor
 
 from policy_pkg.train.episode import Sizes
 from policy_pkg.train.parameters import Shapes, linear
 
 Array = npt.NDArray[Any]
+Params = dict[str, Array]
 
 
 def qmix_shapes(sizes: Sizes, mixing: int, hypernet: int) -> tuple[Shapes, dict[str, int]]:
@@ -34,22 +33,8 @@ def qmix_shapes(sizes: Sizes, mixing: int, hypernet: int) -> tuple[Shapes, dict[
     return named, fan_in
 
 
-def qmix(params: dict[str, Tensor], q: Tensor, state: Tensor) -> Tensor:
-    """Q_tot = ELU(q |W1(s)| + b1(s)) |W2(s)| + V(s), monotonic in every robot's value.
-
-    q: (M, n). state: (M, S), without gradient. Returns (M,).
-    """
-    total: Tensor = _Qmix.apply(q, state, *params.values())
-    return total
-
-
-def vdn(q: Tensor) -> Tensor:
-    """Q_tot = sum of the robots' values (Sunehag et al. 2018). q: (M, n). Returns (M,)."""
-    return q.sum(1)
-
-
 @dataclass(frozen=True)
-class _Pass:
+class Tape:
     """What the forward pass leaves for the backward one; W1 and W2 before the absolute value."""
 
     q: Array  # (M, n)
@@ -60,54 +45,45 @@ class _Pass:
     inner: Array  # (M, mixing) ELU's value
 
 
-class _Qmix(torch.autograd.Function):
-    """The whole mixer as one operation; its small steps would cost more by their number."""
-
-    @staticmethod
-    def forward(ctx: Any, q: Tensor, state: Tensor, *params: Tensor) -> Tensor:
-        ctx.params = [param.numpy() for param in params]
-        total, ctx.saved = _forward(ctx.params, q.numpy(), state.numpy())
-        return torch.from_numpy(total)
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        grad_q, *grads = _backward(ctx.params, ctx.saved, grad.numpy())
-        return (torch.from_numpy(grad_q), None, *(torch.from_numpy(g) for g in grads))
-
-
-def _affine(x: Array, weight: Array, bias: Array) -> Array:
-    out: Array = x @ weight.T
-    out += bias
+def _affine(params: Params, layer: str, x: Array) -> Array:
+    out: Array = x @ params[f"{layer}.weight"].T
+    out += params[f"{layer}.bias"]
     return out
 
 
-def _forward(params: list[Array], q: Array, state: Array) -> tuple[Array, _Pass]:
-    state_w, state_b, w1_w, w1_b, w2_w, w2_b, v_w, v_b = params
-    mixing, hypernet = w2_w.shape
-    first = _affine(state, state_w, state_b)
+def qmix(params: Params, q: Array, state: Array) -> tuple[Array, Tape]:
+    """Q_tot = ELU(q |W1(s)| + b1(s)) |W2(s)| + V(s), monotonic in every robot's value.
+
+    q: (M, n). state: (M, S). Returns (M,), and what ``qmix_gradients`` needs.
+    """
+    mixing, hypernet = params["w2.weight"].shape
+    first = _affine(params, "state", state)
     rectified = first[:, : 2 * hypernet + mixing]
     np.maximum(rectified, 0, out=rectified)
-    w1 = _affine(first[:, :hypernet], w1_w, w1_b)
-    w2 = _affine(first[:, hypernet : 2 * hypernet], w2_w, w2_b)
-    total: Array = _affine(first[:, 2 * hypernet : 2 * hypernet + mixing], v_w, v_b)[:, 0]
+    w1 = _affine(params, "w1", first[:, :hypernet])
+    w2 = _affine(params, "w2", first[:, hypernet : 2 * hypernet])
+    v = _affine(params, "v", first[:, 2 * hypernet : 2 * hypernet + mixing])[:, 0]
     inner = np.empty_like(w2)
     _mix(q, w1, first[:, 2 * hypernet + mixing :], inner)
     # ELU: x where x > 0, else exp(x) - 1
     inner = np.maximum(inner, 0) + np.expm1(np.minimum(inner, 0))
-    total = total + np.einsum("mk,mk->m", inner, np.abs(w2))
-    return total, _Pass(q, state, first, w1, w2, inner)
+    total: Array = np.einsum("mk,mk->m", inner, np.abs(w2)) + v
+    return total, Tape(q, state, first, w1, w2, inner)
 
 
-def _backward(params: list[Array], saved: _Pass, grad: Array) -> list[Array]:
-    """Gradients of q and then of the parameters in their order. grad: (M,)."""
-    _, _, w1_w, _, w2_w, _, v_w, _ = params
+def qmix_gradients(params: Params, tape: Tape, grad: Array, out: Params) -> Array:
+    """Backward of ``qmix``: fills the parameters' gradients ``out``; returns that of q, (M, n).
+
+    grad: (M,) of the loss with respect to Q_tot.
+    """
+    w1_w, w2_w, v_w = params["w1.weight"], params["w2.weight"], params["v.weight"]
     mixing, hypernet = w2_w.shape
-    first, inner, column = saved.first, saved.inner, grad[:, np.newaxis]
-    d_w2 = column * inner * np.sign(saved.w2)
+    first, inner, column = tape.first, tape.inner, grad[:, np.newaxis]
+    d_w2 = column * inner * np.sign(tape.w2)
     # d ELU(x) / dx = 1 where x > 0, else exp(x) = ELU(x) + 1
-    d_inner = column * np.abs(saved.w2) * (np.minimum(inner, 0) + 1)
-    d_q, d_w1 = np.empty_like(saved.q), np.empty_like(saved.w1)
-    _unmix(saved.q, saved.w1, d_inner, d_q, d_w1)
+    d_inner = column * np.abs(tape.w2) * (np.minimum(inner, 0) + 1)
+    d_q, d_w1 = np.empty_like(tape.q), np.empty_like(tape.w1)
+    _unmix(tape.q, tape.w1, d_inner, d_q, d_w1)
     d_first = np.empty_like(first)
     np.matmul(d_w1, w1_w, out=d_first[:, :hypernet])
     np.matmul(d_w2, w2_w, out=d_first[:, hypernet : 2 * hypernet])
@@ -115,17 +91,15 @@ def _backward(params: list[Array], saved: _Pass, grad: Array) -> list[Array]:
     rectified = 2 * hypernet + mixing
     d_first[:, :rectified] *= first[:, :rectified] > 0
     d_first[:, rectified:] = d_inner
-    return [
-        d_q,
-        d_first.T @ saved.state,
-        d_first.sum(0),
-        d_w1.T @ first[:, :hypernet],
-        d_w1.sum(0),
-        d_w2.T @ first[:, hypernet : 2 * hypernet],
-        d_w2.sum(0),
-        grad[np.newaxis] @ first[:, 2 * hypernet : rectified],
-        grad.sum(keepdims=True),
-    ]
+    out["state.weight"][:] = d_first.T @ tape.state
+    out["state.bias"][:] = d_first.sum(0)
+    out["w1.weight"][:] = d_w1.T @ first[:, :hypernet]
+    out["w1.bias"][:] = d_w1.sum(0)
+    out["w2.weight"][:] = d_w2.T @ first[:, hypernet : 2 * hypernet]
+    out["w2.bias"][:] = d_w2.sum(0)
+    out["v.weight"][:] = grad @ first[:, 2 * hypernet : rectified]
+    out["v.bias"][:] = grad.sum()
+    return d_q
 
 
 @njit(cache=True)

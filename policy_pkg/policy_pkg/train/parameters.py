@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from torch import Tensor
 
+Array = npt.NDArray[Any]
 Shapes = dict[str, tuple[int, ...]]
 
 
@@ -37,28 +36,23 @@ def initial_values(
 
 
 class FlatParameters:
-    """Named tensors over one flat vector, both leaves of autograd.
+    """Named parameters over one flat vector, and their gradients likewise; all views."""
 
-    ``gradient`` is the flat gradient; ``flat.grad`` and the named tensors' gradients are views.
-    """
-
-    def __init__(self, shapes: Shapes, values: npt.NDArray[np.float64], dtype: torch.dtype) -> None:
-        self.flat = torch.from_numpy(values).to(dtype, copy=True)
-        self.gradient = torch.zeros_like(self.flat)
-        self.named = self._views(self.flat.detach(), shapes)
-        for name, view in self._views(self.gradient, shapes).items():
-            self.named[name].requires_grad_().grad = view
-        self.flat.requires_grad_().grad = self.gradient
+    def __init__(self, shapes: Shapes, values: Array, dtype: npt.DTypeLike) -> None:
+        self.flat: Array = values.astype(dtype)
+        self.gradient = np.zeros_like(self.flat)
+        self.named = self._views(self.flat, shapes)
+        self.named_gradients = self._views(self.gradient, shapes)
 
     @staticmethod
-    def _views(flat: Tensor, shapes: Shapes) -> dict[str, Tensor]:
-        parts = flat.split_with_sizes([prod(shape) for shape in shapes.values()])
-        return {name: part.view(shapes[name]) for name, part in zip(shapes, parts, strict=True)}
-
-    def arrays(self, prefix: str = "") -> dict[str, npt.NDArray[Any]]:
-        """The named values whose names start with ``prefix``, which is cut off; no copy."""
+    def _views(flat: Array, shapes: Shapes) -> dict[str, Array]:
+        parts = np.split(flat, np.cumsum([prod(shape) for shape in shapes.values()])[:-1])
         return {
-            name.removeprefix(prefix): tensor.detach().numpy()
-            for name, tensor in self.named.items()
-            if name.startswith(prefix)
+            name: part.reshape(shape)
+            for part, (name, shape) in zip(parts, shapes.items(), strict=True)
         }
+
+
+def part(named: dict[str, Array], prefix: str) -> dict[str, Array]:
+    """Those whose names start with ``prefix``, without it."""
+    return {k.removeprefix(prefix): v for k, v in named.items() if k.startswith(prefix)}
