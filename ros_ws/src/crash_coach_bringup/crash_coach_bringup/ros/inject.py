@@ -17,22 +17,23 @@ COACH = "/coach"
 
 
 class InjectError(UserError):
-    """The coach refused; the text is its reason."""
+    """Nothing was changed; the text is the reason."""
 
 
 @dataclass(frozen=True)
 class InjectResult:
-    """What the coach accepted, and its answer."""
+    """What the coach accepted."""
 
     victims: tuple[str, ...]
     mode: str
     apply_at: str
     start_step: int
     duration_steps: int
-    answer: str
 
     def __str__(self) -> str:
-        return f"{', '.join(self.victims)}: {self.mode} from the {self.apply_at.replace('_', ' ')}"
+        return (
+            f"{', '.join(self.victims)}: {self.mode} from the {self.apply_at.replace('_', ' ')} on"
+        )
 
 
 def inject(
@@ -56,9 +57,11 @@ def inject(
         domain: ROS domain; None: the environment's.
 
     Raises:
-        InjectError: the coach refused, with its reason.
+        InjectError: no victims, or the coach refused, with its reason.
         WaitError: no coach on this domain, or no answer.
     """
+    if not victims:
+        raise InjectError("name at least one robot to crash")
     wanted = {
         "enabled": True,
         "strategy": "fixed",
@@ -76,7 +79,7 @@ def inject(
         result = client.result(future, timeout_s, "the coach's answer").result
     if not result.successful:
         raise InjectError(f"the coach refused: {result.reason}")
-    return InjectResult(tuple(victims), mode, apply_at, start_step, duration_steps, result.reason)
+    return InjectResult(tuple(victims), mode, apply_at, start_step, duration_steps)
 
 
 def clear(timeout_s: float = 10.0, domain: int | None = None) -> str:

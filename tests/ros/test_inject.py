@@ -1,0 +1,143 @@
+"""The injection client against a running graph: what it sets counts, what is wrong is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from crash_coach_interfaces.msg import EpisodeState, FaultEvent
+
+from crash_coach_bringup.ros.client import GraphClient, WaitError, graph_client
+from crash_coach_bringup.ros.domain import reserve_domain
+from crash_coach_bringup.ros.graph import UpOptions, check_team, graph_environment, graph_processes
+from crash_coach_bringup.ros.inject import InjectError, InjectResult, clear, inject
+from crash_coach_bringup.ros.supervisor import Supervisor
+from policy_pkg.untrained import write_untrained
+from sim_pkg.env import make_env
+
+WAIT_S = 30.0
+
+
+@dataclass(frozen=True)
+class Graph:
+    """A lock-step graph that plays episode after episode."""
+
+    client: GraphClient
+    domain: int
+
+    def episodes(self, count: int) -> list[EpisodeState]:
+        """The states of the next ``count`` whole episodes; a new reader gets no old ones."""
+        states: list[EpisodeState] = []
+        node = self.client.node
+        reader = node.create_subscription(EpisodeState, "/sim/episode", states.append, 1000)
+        self.client.until(lambda: len(states) > 0, WAIT_S, "a control step")
+        first = states[-1].episode + 1
+        self.client.until(lambda: states[-1].episode >= first + count, WAIT_S, f"{count} episodes")
+        node.destroy_subscription(reader)
+        return [s for s in states if first <= s.episode < first + count]
+
+
+@pytest.fixture(scope="module")
+def graph(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Graph]:
+    folder = tmp_path_factory.mktemp("graph")
+    checkpoint = folder / "step_0"
+    write_untrained(checkpoint, make_env("buttons", 1).spec, seed=1)
+    options = UpOptions("buttons", checkpoint, layout="team")
+    processes = graph_processes(options, check_team(options))
+    with (
+        reserve_domain() as domain,
+        Supervisor(processes, folder, graph_environment(domain)) as supervisor,
+    ):
+
+        def check() -> None:
+            for ended in supervisor.wait(0.0):
+                raise AssertionError(ended.describe())
+
+        with graph_client("looker", domain, check) as client:
+            yield Graph(client, domain)
+
+
+@pytest.fixture(autouse=True)
+def no_fault(graph: Graph) -> Iterator[None]:
+    graph.episodes(1)
+    yield
+    clear(domain=graph.domain)
+
+
+def crashed(states: list[EpisodeState]) -> set[tuple[int, ...]]:
+    """Who was crashed in the steps that led to these states."""
+    return {tuple(state.crashed) for state in states if state.step > 0}
+
+
+def test_a_robot_is_muted_from_the_very_next_step_and_cleared(graph: Graph) -> None:
+    assert crashed(graph.episodes(1)) == {(0, 0)}
+    states: list[EpisodeState] = []
+    events: list[FaultEvent] = []
+    node = graph.client.node
+    readers = [
+        node.create_subscription(EpisodeState, "/sim/episode", states.append, 1000),
+        node.create_subscription(FaultEvent, "/coach/events", events.append, 1000),
+    ]
+    graph.client.until(lambda: len(states) > 0, WAIT_S, "a control step")
+    result = inject(("robot_1",), "mute", domain=graph.domain)
+    assert result == InjectResult(("robot_1",), "mute", "next_step", 0, 0)
+    assert str(result) == "robot_1: mute from the next step on"
+    graph.client.pause(0.5)
+    effects = [e for e in events if e.kind == FaultEvent.EFFECT]
+    assert {(e.robot, e.mode, e.applied) for e in effects} == {("robot_1", "mute", -1)}
+    first = effects[0]
+    (armed,) = [e for e in events if e.kind == FaultEvent.ARMED and e.revision == first.revision]
+    assert (first.episode, first.step) == (armed.episode, armed.step)
+    for state in states:
+        faulted = (state.episode, state.step) > (armed.episode, armed.step)
+        assert state.step == 0 or tuple(state.crashed) == ((1, 0) if faulted else (0, 0))
+    for reader in readers:
+        node.destroy_subscription(reader)
+    assert clear(domain=graph.domain) == "every fault is cleared; enabled is now false"
+    assert crashed(graph.episodes(2)) == {(0, 0)}
+
+
+def test_from_the_next_episode_on(graph: Graph) -> None:
+    inject(("robot_2",), "random", apply_at="next_episode", domain=graph.domain)
+    assert crashed(graph.episodes(2)) == {(0, 1)}
+
+
+def test_a_part_of_each_episode(graph: Graph) -> None:
+    options = {"apply_at": "next_episode", "start_step": 2, "duration_steps": 3}
+    inject(("robot_1", "robot_2"), "mute", domain=graph.domain, **options)  # type: ignore[arg-type]
+    for state in graph.episodes(2):
+        if state.step > 0:
+            assert tuple(state.crashed) == ((1, 1) if 2 <= state.step - 1 < 5 else (0, 0))
+
+
+@pytest.mark.parametrize(
+    ("victims", "mode", "apply_at", "duration", "reason"),
+    [
+        (("robot_9",), "mute", "next_step", 0, "unknown robot 'robot_9'.*robot_1, robot_2"),
+        (("robot_1", "robot_1"), "mute", "next_step", 0, "robot_1 more than once"),
+        (("robot_1",), "explode", "next_step", 0, "crash_mode 'explode'.*'random'"),
+        (("robot_1",), "mute", "now", 0, "apply_at 'now'.*'next_step'"),
+        (("robot_1",), "mute", "next_step", -1, "duration_steps"),
+    ],
+)
+def test_what_is_wrong_is_refused_whole(
+    graph: Graph, victims: tuple[str, ...], mode: str, apply_at: str, duration: int, reason: str
+) -> None:
+    with pytest.raises(InjectError, match=f"the coach refused: .*{reason}"):
+        inject(victims, mode, apply_at, duration, domain=graph.domain)
+    assert crashed(graph.episodes(1)) == {(0, 0)}
+
+
+def test_nobody_is_not_a_victim(graph: Graph) -> None:
+    with pytest.raises(InjectError, match="name at least one robot"):
+        inject((), "mute", domain=graph.domain)
+
+
+def test_a_domain_without_a_coach_is_named(ros_env: dict[str, str], tmp_path: Path) -> None:
+    text = f"waited 0.3 s for a node /coach on ROS domain {ros_env['ROS_DOMAIN_ID']}"
+    with pytest.raises(WaitError, match=text):
+        inject(("robot_1",), "mute", timeout_s=0.3)
+    with pytest.raises(WaitError, match=text):
+        clear(timeout_s=0.3)
