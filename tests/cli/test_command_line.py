@@ -89,7 +89,7 @@ def test_wrong_conditions_are_named(
 def test_several_runs_get_folders_of_their_own(tmp_path: Path) -> None:
     jobs = plan_jobs(["buttons/qmix", "buttons/adaptive"], tmp_path, [], [1, 2], False)
     folders = [job.out_dir.relative_to(tmp_path).name for job in jobs]
-    assert folders == ["qmix-s1", "qmix-s2", "adaptive-s1", "adaptive-s2"]
+    assert folders == ["qmix-s1", "adaptive-s1", "qmix-s2", "adaptive-s2"]
     (one,) = plan_jobs(["buttons/qmix"], tmp_path, ["total_steps=5"], [7], False)
     assert (one.out_dir, one.config.seed, one.config.total_steps) == (tmp_path, 7, 5)
 

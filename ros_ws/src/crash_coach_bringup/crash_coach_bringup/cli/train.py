@@ -19,8 +19,8 @@ def plan_jobs(
     chosen: list[int | None] = [*seeds] if seeds else [None]
     single = len(configs) == 1 and len(chosen) == 1
     jobs: dict[Path, Job] = {}
-    for config_name in configs:
-        for seed in chosen:
+    for seed in chosen:  # all configurations of a seed first: what is finished can be compared
+        for config_name in configs:
             config = load_train_config(config_name, overrides, seed)
             name = f"{Path(config_name).stem}-s{config.seed}"
             folder = out if single else out / name
