@@ -47,8 +47,9 @@ class SimTopics:
         self._observations = convert.ObservationWriter(spec, self._header)
         self._episode = convert.EpisodeWriter(spec, seed, self._header)
         self._clock = Clock(clock=self._header.stamp)
+        # A whole episode, so that a reader that falls behind within one loses nothing of it.
         latched = QoSProfile(
-            depth=10,
+            depth=spec.episode_limit + 1,
             reliability=ReliabilityPolicy.RELIABLE,
             durability=DurabilityPolicy.TRANSIENT_LOCAL,
         )

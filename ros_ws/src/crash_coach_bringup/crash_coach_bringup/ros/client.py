@@ -12,6 +12,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.task import Future
 
+from crash_coach_bringup.ros.discovery import use_quick_discovery
 from sim_pkg.contract import UserError
 
 SPIN_S = 0.05
@@ -58,6 +59,7 @@ def graph_client(
     name: str, domain: int | None = None, check: Callable[[], None] = lambda: None
 ) -> Iterator[GraphClient]:
     """A client on ``domain`` (None: the environment's), independent of rclpy's global state."""
+    use_quick_discovery()
     context = Context()
     context.init(args=[], domain_id=domain)
     try:

@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from ament_index_python.packages import get_package_share_directory
-
+from crash_coach_bringup.ros import discovery
 from crash_coach_bringup.ros.probe import find_executable
 from crash_coach_pkg.config import CoachConfig
 from policy_pkg.checkpoint import load_policy
@@ -88,15 +87,8 @@ def domain_id(options: UpOptions) -> int:
 
 
 def graph_environment(domain: int) -> dict[str, str]:
-    """What the processes' environment needs: the domain, and quick discovery (fastdds.xml).
-
-    Raises GraphError where the workspace was built without that file.
-    """
-    profiles = Path(get_package_share_directory("crash_coach_bringup")) / "config" / "fastdds.xml"
-    if not profiles.is_file():
-        raise GraphError(f"{profiles} is not installed; run 'make setup'")
-    chosen = os.environ.get("FASTRTPS_DEFAULT_PROFILES_FILE", str(profiles))
-    return {"ROS_DOMAIN_ID": str(domain), "FASTRTPS_DEFAULT_PROFILES_FILE": chosen}
+    """What the processes' environment needs. Raises UserError as discovery.profiles_file."""
+    return {"ROS_DOMAIN_ID": str(domain), discovery.VARIABLE: discovery.profiles_file()}
 
 
 def ros_arguments(start: list[str], prefix: str, parameters: Mapping[str, Value]) -> list[str]:
