@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 import signal
-import subprocess
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import rclpy
-from ament_index_python.packages import get_package_prefix
-from crash_coach_interfaces.msg import Action, EpisodeState, FaultEvent, Observation
+from crash_coach_interfaces.msg import Action, Observation
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
-from std_srvs.srv import SetBool, Trigger
+from sim_driver import LEFT, RIGHT, STAY, UP, Driver, Env, end_of, sim
+from std_srvs.srv import SetBool
 from visualization_msgs.msg import Marker, MarkerArray
 
 from sim_pkg.config import ConfigError
@@ -31,118 +23,6 @@ from sim_pkg.contract import BoolArray
 from sim_pkg.env import make_env
 from sim_pkg.ros.sim_node import SimNode
 from sim_pkg.trajectory import TrajectoryHash
-
-Env = dict[str, str]
-ROBOTS = ("robot_1", "robot_2")
-UP, DOWN, LEFT, RIGHT, STAY = range(5)
-WAIT_S = 20.0
-
-
-@contextmanager
-def sim(env: Env, **parameters: object) -> Iterator[subprocess.Popen[str]]:
-    """The sim, killed at the end if it still runs."""
-    command = [str(Path(get_package_prefix("sim_pkg")) / "lib" / "sim_pkg" / "sim"), "--ros-args"]
-    for name, value in parameters.items():
-        text = str(value).lower() if isinstance(value, bool) else str(value)
-        command += ["-p", f"{name}:={text}"]
-    process = subprocess.Popen(
-        command, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
-    try:
-        yield process
-    finally:
-        if process.poll() is None:
-            process.kill()
-        process.communicate(timeout=10)
-
-
-def end_of(process: subprocess.Popen[str], driver: Driver | None = None) -> tuple[int, str]:
-    """Exit code and stderr, in bounded time; the driver answers meanwhile."""
-    if driver is not None:
-        driver.until(lambda: process.poll() is not None)
-    _, errors = process.communicate(timeout=WAIT_S)
-    assert "Traceback" not in errors, errors
-    return process.returncode, errors
-
-
-class Driver:
-    """Stands in for gate and policies: answers observations by a rule, and records."""
-
-    def __init__(self, robots: tuple[str, ...] = ROBOTS) -> None:
-        self.context = Context()
-        rclpy.init(context=self.context)
-        self.node = Node("driver", context=self.context)
-        self._executor = SingleThreadedExecutor(context=self.context)
-        self._executor.add_node(self.node)
-        one = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
-        self.one, self.ten = one, QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-        latched = QoSProfile(
-            depth=100,
-            reliability=ReliabilityPolicy.RELIABLE,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL,
-        )
-        self.robots = robots
-        self.rule: Callable[[int, Observation], int | None] = lambda i, o: STAY
-        self.fault = Action.FAULT_NONE
-        self.seen: list[tuple[int, Observation]] = []
-        self.states: list[EpisodeState] = []
-        self._commands = [self.node.create_publisher(Action, f"/{r}/command", one) for r in robots]
-        self._events = self.node.create_publisher(FaultEvent, "/coach/events", 100)
-        for i, robot in enumerate(robots):
-            self.node.create_subscription(
-                Observation, f"/{robot}/observation", partial(self._answer, i), one
-            )
-        self.node.create_subscription(EpisodeState, "/sim/episode", self.states.append, latched)
-
-    def close(self) -> None:
-        self._executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self.context)
-
-    def command(self, robot: int, obs: Observation, action: int) -> None:
-        message = Action(header=obs.header, episode=obs.episode, step=obs.step, action=action)
-        message.fault = self.fault
-        self._commands[robot].publish(message)
-
-    def mute(self, robot: int, obs: Observation) -> None:
-        event = FaultEvent(header=obs.header, kind=FaultEvent.EFFECT, episode=obs.episode)
-        event.step, event.robot, event.mode = obs.step, self.robots[robot], "mute"
-        event.intent, event.applied = UP, -1
-        self._events.publish(event)
-
-    def _answer(self, robot: int, obs: Observation) -> None:
-        self.seen.append((robot, obs))
-        action = self.rule(robot, obs)
-        if action is not None:
-            self.command(robot, obs, action)
-
-    def until(self, what: Callable[[], Any], timeout_s: float = WAIT_S) -> Any:
-        """Spins until ``what()`` is true and returns it."""
-        end = time.monotonic() + timeout_s
-        while time.monotonic() < end:
-            value = what()
-            if value:
-                return value
-            self._executor.spin_once(timeout_sec=0.05)
-        raise AssertionError(f"not within {timeout_s} s; {len(self.states)} episode states came")
-
-    def spin(self, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self._executor.spin_once(timeout_sec=0.02)
-
-    def call(self, service: str, kind: Any, request: Any) -> Any:
-        client = self.node.create_client(kind, service)
-        self.until(client.service_is_ready)
-        future = client.call_async(request)
-        self.until(future.done)
-        return future.result()
-
-    def trigger(self, service: str) -> Any:
-        return self.call(service, Trigger, Trigger.Request())
-
-    def ends(self) -> list[EpisodeState]:
-        return [s for s in self.states if s.terminated or s.truncated]
 
 
 @pytest.fixture
@@ -213,17 +93,16 @@ def test_a_lost_observation_is_sent_again_and_a_duplicate_changes_nothing(
         if obs.step in (2, 5) and key not in dropped:
             dropped.add(key)
             return None
-        driver.command(robot, obs, RIGHT if robot == 0 else UP)  # and once more on return
-        return DOWN if obs.step == 3 else RIGHT if robot == 0 else UP
+        driver.command(robot, obs, RIGHT if robot == 0 else UP)
+        return RIGHT if robot == 0 else UP  # the same once more
 
     driver.rule = forgetful
     with sim(ros_env, episodes=1, resend_after_s=0.1) as process:
         (end,) = driver.until(driver.ends)
         assert end_of(process)[0] == 0
     assert dropped == {(0, 2), (0, 5), (1, 2), (1, 5)}
-    # The first answer to step 3 counts, not the contradicting second one.
-    (after,) = [s for s in driver.states if s.step == 4]
-    assert after.actions.tolist() == [RIGHT, UP]
+    assert [s.step for s in driver.states] == list(range(21))
+    assert all(s.actions.tolist() == [RIGHT, UP] for s in driver.states[1:])
     assert end.step == 20
 
 
@@ -273,7 +152,7 @@ def test_nobody_there(ros_env: Env) -> None:
 
 
 def test_a_second_sim_is_refused(ros_env: Env, driver: Driver) -> None:
-    with sim(ros_env) as first:
+    with sim(ros_env, max_resends=1000) as first:
         driver.until(lambda: len(driver.states) > 2)
         driver.rule = lambda robot, obs: None  # the first waits; only the second may end
         with sim(ros_env) as second:
@@ -332,10 +211,14 @@ def test_sigint_ends_it_cleanly(ros_env: Env, driver: Driver) -> None:
 
 
 def test_sigterm_while_it_waits_for_robots(ros_env: Env) -> None:
-    with sim(ros_env, match_timeout_s=20) as process:
-        time.sleep(2.0)
-        process.send_signal(signal.SIGTERM)
-        code, errors = end_of(process)
+    driver = Driver(())
+    try:
+        with sim(ros_env, match_timeout_s=60) as process:
+            driver.until(lambda: driver.node.count_publishers("/sim/episode"))
+            process.send_signal(signal.SIGTERM)
+            code, errors = end_of(process)
+    finally:
+        driver.close()
     assert (code, errors) == (0, "")
 
 
