@@ -1,17 +1,21 @@
-"""The gate's reading and writing of serialized commands, against rclpy's own serialization."""
+"""What gate and coach read and write in serialized form, against rclpy's own serialization."""
 
 from __future__ import annotations
 
+from array import array
+
 import pytest
-from crash_coach_interfaces.msg import Action, FaultEvent
+from crash_coach_interfaces.msg import Action, EpisodeState, FaultEvent
 from rclpy.serialization import deserialize_message, serialize_message
 
 from crash_coach_pkg.gate_state import Decision
 from crash_coach_pkg.plan import Mode
 from crash_coach_pkg.ros.convert import (
+    Played,
     bytes_from_decision,
     command_from_bytes,
     effect_from_decision,
+    played_from_bytes,
 )
 from sim_pkg.contract import UserError
 
@@ -61,3 +65,21 @@ def test_other_bytes_are_refused() -> None:
     for size in (8, 20, 30):
         with pytest.raises(UserError, match=f"command of {size} bytes is cut short"):
             command_from_bytes(0, data[:size])
+
+
+@pytest.mark.parametrize("frame_id", ["", "m", "ma", "map", "base", "odom_1"])
+@pytest.mark.parametrize("state_size", [0, 1, 2, 3, 8])
+def test_the_end_of_an_episode_is_read(frame_id: str, state_size: int) -> None:
+    for ended, success in (("terminated", True), ("truncated", False), ("", False)):
+        message = EpisodeState(episode=2**32 - 2, step=5, seed=2**64 - 1, reward=-1.0)
+        message.header.frame_id = frame_id
+        message.state = array("f", [0.5] * state_size)
+        message.success = success
+        if ended:
+            setattr(message, ended, True)
+        data = serialize_message(message)
+        assert played_from_bytes(data) == Played(2**32 - 2, bool(ended), success)
+        with pytest.raises(UserError, match="cut short"):
+            played_from_bytes(data[:40])
+        with pytest.raises(UserError, match="0000 is not little-endian CDR"):
+            played_from_bytes(b"\0\0" + data[2:])

@@ -39,7 +39,7 @@ from crash_coach_pkg.parameters import (
     parameter_specs,
 )
 from crash_coach_pkg.plan import CrashPlan
-from crash_coach_pkg.ros.convert import message_from_plan
+from crash_coach_pkg.ros.convert import message_from_plan, played_from_bytes
 from crash_coach_pkg.ros.run import (
     EPISODE,
     EVENTS,
@@ -81,7 +81,7 @@ class CoachLink(Node):
         self._check = check
         self._due_s = 0.0
         self._plans = self.create_publisher(CrashPlanMessage, "/coach/plan", PLAN)
-        self.create_subscription(EpisodeState, "/sim/episode", self._on_episode, EPISODE)
+        self.create_subscription(EpisodeState, "/sim/episode", self._on_episode, EPISODE, raw=True)
         self.create_subscription(FaultEvent, "/coach/events", self._on_event, EVENTS)
         self.create_timer(TICK_S, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -94,12 +94,15 @@ class CoachLink(Node):
         stamp = self.get_clock().now().to_msg()
         self._plans.publish(message_from_plan(plan, self._robots, lease_s, stamp))
 
-    def _on_episode(self, message: EpisodeState) -> None:
+    def _on_episode(self, data: bytes) -> None:
+        try:
+            played = played_from_bytes(data)
+        except UserError as error:
+            self.get_logger().error(f"{error}; ignored")
+            return
         with self.changed:
-            self.publish(self.control.follow(message.episode))
-            record = None
-            if message.terminated or message.truncated:
-                record = self.control.finish(message.success)
+            self.publish(self.control.follow(played.episode))
+            record = self.control.finish(played.success) if played.ended else None
         if record is not None:
             self.get_logger().info(f"block: {record}")
 

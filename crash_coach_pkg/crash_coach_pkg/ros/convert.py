@@ -8,6 +8,7 @@ XCDR version 1); a test holds it against rclpy's own serialization.
 from __future__ import annotations
 
 import struct
+from dataclasses import dataclass
 
 from builtin_interfaces.msg import Time
 from crash_coach_interfaces.msg import Action, FaultEvent
@@ -22,6 +23,8 @@ from sim_pkg.contract import UserError
 
 # Encapsulation (4 bytes), stamp (8), length of frame_id (4), frame_id, padding to 4, fields.
 _LITTLE_ENDIAN = b"\x00\x01"
+_ENCAPSULATION_SIZE = 4
+_FLAGS = struct.Struct("<???")  # terminated, truncated, success
 _LENGTH = struct.Struct("<I")
 _FRAME_ID_AT = 16
 _COMMANDED = struct.Struct("<IIiB")  # episode, step, action, fault
@@ -119,6 +122,41 @@ def effect_from_decision(decision: Decision, robots: tuple[str, ...]) -> FaultEv
         intent=command.action,
         applied=decision.applied,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """What the coach reads of an EpisodeState."""
+
+    episode: int
+    ended: bool
+    success: bool
+
+
+def played_from_bytes(data: bytes) -> Played:
+    """A serialized EpisodeState, of which one arrives per control step.
+
+    Raises:
+        UserError: not little-endian CDR, or cut short.
+    """
+    if data[:2] != _LITTLE_ENDIAN:
+        raise UserError(f"episode: encapsulation {data[:2].hex()} is not little-endian CDR")
+    try:
+        (length,) = _LENGTH.unpack_from(data, _FRAME_ID_AT - _LENGTH.size)
+        start = _FRAME_ID_AT + (length + 3 & ~3)
+        (episode,) = _LENGTH.unpack_from(data, start)
+        count_at = _align_8(start + 8) + 8  # behind episode, step and seed
+        (count,) = _LENGTH.unpack_from(data, count_at)
+        flags_at = _align_8(count_at + 4 + 4 * count) + 16  # behind state, reward, return
+        terminated, truncated, success = _FLAGS.unpack_from(data, flags_at)
+    except struct.error as error:
+        raise UserError(f"episode of {len(data)} bytes is cut short: {error}") from error
+    return Played(episode, terminated or truncated, success)
+
+
+def _align_8(offset: int) -> int:
+    """CDR aligns from behind the encapsulation."""
+    return (offset - _ENCAPSULATION_SIZE + 7 & ~7) + _ENCAPSULATION_SIZE
 
 
 def message_from_event(event: Event, stamp: Time) -> FaultEvent:
