@@ -9,7 +9,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-import rclpy
 from crash_coach_interfaces.msg import Action, Observation
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
@@ -18,10 +17,8 @@ from sim_driver import LEFT, RIGHT, STAY, UP, Driver, Env, end_of, sim
 from std_srvs.srv import SetBool
 from visualization_msgs.msg import Marker, MarkerArray
 
-from sim_pkg.config import ConfigError
 from sim_pkg.contract import BoolArray
 from sim_pkg.env import make_env
-from sim_pkg.ros.sim_node import SimNode
 from sim_pkg.trajectory import TrajectoryHash
 
 
@@ -160,46 +157,6 @@ def test_a_second_sim_is_refused(ros_env: Env, driver: Driver) -> None:
         assert code == 1
         assert f"another sim (process {first.pid}) runs on ROS domain" in errors
         assert first.poll() is None
-
-
-def test_a_bad_start_is_one_line_and_exit_code_1(ros_env: Env) -> None:
-    with sim(ros_env, senario="buttons") as process:
-        code, errors = end_of(process)
-    assert code == 1
-    assert errors.startswith(
-        "sim: error: unknown parameter 'senario' (did you mean 'scenario'?); known: scenario, mode"
-    )
-    assert errors.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [
-        ("resend_afters:=1.0", r"unknown parameter 'resend_afters' .*'resend_after_s'"),
-        ("resend_after_s:=.nan", "parameter resend_after_s = nan"),
-        ("mode:=fast", "parameter mode = 'fast'"),
-        ("seed:=-1", "parameter seed = -1"),
-        ("episodes:=many", "parameter episodes = 'many'"),
-        ("scenario:=butons", r"unknown scenario 'butons' \(did you mean 'buttons'\?\)"),
-    ],
-)
-def test_bad_parameters(ros_env: Env, parameters: str, message: str) -> None:
-    rclpy.init(args=["--ros-args", "-p", parameters])
-    try:
-        with pytest.raises(ConfigError, match=message):
-            SimNode()
-    finally:
-        rclpy.shutdown()
-
-
-def test_whole_numbers_do_for_seconds(ros_env: Env) -> None:
-    rclpy.init(args=["--ros-args", "-p", "resend_after_s:=1"])
-    try:
-        node = SimNode()
-        assert node.get_parameter("resend_after_s").value == 1
-        node.destroy_node()
-    finally:
-        rclpy.shutdown()
 
 
 def test_sigint_ends_it_cleanly(ros_env: Env, driver: Driver) -> None:
