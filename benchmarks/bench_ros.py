@@ -117,7 +117,7 @@ def lockstep_steps_per_s(folder: Path, robots: int, layout: Layout, gate: bool) 
     """Control steps per second of a graph that nobody listens to."""
     scenario = SCENARIOS[robots]
     spec = make_env(scenario, 1).spec
-    checkpoint = folder / f"step_{robots}"
+    checkpoint = folder / scenario / "step_0"
     if not checkpoint.exists():
         write_untrained(checkpoint, spec, seed=0)
     options = UpOptions(scenario, checkpoint, layout=layout, gate=gate)

@@ -13,7 +13,7 @@ SCALE = 0.3  # wide enough that the action depends on observation and memory
 
 
 def write_untrained(folder: Path, spec: EnvSpec, seed: int, hidden: int = 64) -> None:
-    """Writes a checkpoint of the scenario's sizes to ``folder``, which must not exist.
+    """Writes a checkpoint of the scenario's sizes to ``folder``, the only one in its parent.
 
     Raises:
         OSError: it cannot be written.
