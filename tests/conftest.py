@@ -6,6 +6,8 @@ import os
 from collections.abc import Iterator
 
 import pytest
+
+from crash_coach_bringup.ros import discovery
 from crash_coach_bringup.ros.domain import reserve_domain
 
 
@@ -15,4 +17,5 @@ def ros_env(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, str]]:
     with reserve_domain() as domain:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
         monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        monkeypatch.setenv(discovery.VARIABLE, discovery.profiles_file())
         yield dict(os.environ)
