@@ -132,7 +132,7 @@ def test_up_inject_and_param_set(folder: Path, env: dict[str, str]) -> None:
     with running(folder, up, env):
         wait_for_steps(env)
         typed(folder, inject, env)
-        output = typed(folder, [". ./env.sh", *block("ros2 param set /coach crash_mode mute")], env)
+        output = typed(folder, [". ./env.sh", *block("ros2 param set /coach enabled true")], env)
         assert "fail" not in output.lower()
         wait_for_steps(env)
 
@@ -164,7 +164,7 @@ def test_no_block_is_left_out() -> None:
         "make demo",
         ". ./env.sh",
         ". ./env.sh",
-        "ros2 param set /coach crash_mode mute",
+        "ros2 param set /coach enabled true",
         "crash-coach doctor",
         f"source {DISTRIBUTION}",
         'ros2 run crash_coach_pkg gate --ros-args -p robots:="[robot_1, robot_2]"',

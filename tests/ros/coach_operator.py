@@ -14,6 +14,8 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from std_srvs.srv import Trigger
 
+from crash_coach_bringup.ros.client import greet
+
 WAIT_S = 20.0
 
 
@@ -34,6 +36,7 @@ class Operator:
         self.executor.add_node(self.node)
         self.parameters = AsyncParameterClient(self.node, "/coach")
         self.clearing = self.node.create_client(Trigger, "/coach/clear_all")
+        greet(self.node, "/coach", self.executor.spin_once, WAIT_S, "/coach")
         end = time.monotonic() + WAIT_S
         while not (self.parameters.services_are_ready() and self.clearing.service_is_ready()):
             assert time.monotonic() < end, "no /coach"

@@ -19,6 +19,8 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
+from crash_coach_bringup.ros.client import greet
+
 Env = dict[str, str]
 ROBOTS = ("robot_1", "robot_2")
 UP, DOWN, LEFT, RIGHT, STAY = range(5)
@@ -120,6 +122,7 @@ class Driver:
 
     def call(self, service: str, kind: Any, request: Any) -> Any:
         client = self.node.create_client(kind, service)
+        greet(self.node, "/sim", self._executor.spin_once, WAIT_S, "/sim")
         self.until(client.service_is_ready)
         future = client.call_async(request)
         self.until(future.done)

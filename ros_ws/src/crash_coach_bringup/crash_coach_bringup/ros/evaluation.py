@@ -113,6 +113,7 @@ class Collector:
         self._subscription = client.node.create_subscription(
             EpisodeState, "/sim/episode", self._on_state, qos
         )
+        client.greet("/sim", START_S, "the sim to start")
         client.until(self._ready, START_S, "the sim to serve /sim/reset")
 
     def _ready(self) -> bool:

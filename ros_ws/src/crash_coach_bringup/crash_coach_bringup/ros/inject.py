@@ -74,6 +74,7 @@ def inject(
     parameters = [Parameter(name, value=value) for name, value in wanted.items()]
     with graph_client("crash_coach_inject", domain) as client:
         setter = AsyncParameterClient(client.node, COACH)
+        client.greet(COACH, timeout_s, _no_coach(domain))
         client.until(setter.services_are_ready, timeout_s, _no_coach(domain))
         future = setter.set_parameters_atomically(parameters)
         result = client.result(future, timeout_s, "the coach's answer").result
@@ -95,6 +96,7 @@ def clear(timeout_s: float = 10.0, domain: int | None = None) -> str:
 
 def _clear(client: GraphClient, timeout_s: float, domain: int | None) -> str:
     service = client.node.create_client(Trigger, f"{COACH}/clear_all")
+    client.greet(COACH, timeout_s, _no_coach(domain))
     client.until(service.service_is_ready, timeout_s, _no_coach(domain))
     future = service.call_async(Trigger.Request())
     answer = client.result(future, timeout_s, "the coach's answer")
