@@ -21,7 +21,9 @@ from crash_coach_bringup.ros.client import graph_client
 from crash_coach_bringup.ros.domain import reserve_domain
 
 ROOT = Path(__file__).resolve().parent.parent
-SMALL_DEMO = "--episodes 2 --set total_steps=2000 test_interval_steps=1000 tensorboard=false"
+SMALL_DEMO = (
+    "--layout single --episodes 2 --set total_steps=2000 test_interval_steps=1000 tensorboard=false"
+)
 DISTRIBUTION = Path("/opt/ros/jazzy/setup.bash")
 
 
