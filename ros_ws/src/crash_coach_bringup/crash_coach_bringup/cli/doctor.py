@@ -60,15 +60,16 @@ def library(name: str) -> Finding:
 
 
 def underlay() -> Finding:
-    if os.environ.get("ROS_DISTRO") == "jazzy":
-        return Finding("ROS underlay", True, "distribution (ROS_DISTRO=jazzy)")
+    distribution = os.environ.get("ROS_DISTRO") == "jazzy"
     try:
         module = importlib.import_module("rclpy")
     except ImportError as error:
-        return Finding("ROS underlay", False, str(error), "run 'make setup', then '. ./env.sh'")
-    wheel = importlib.metadata.version("ros-rclpy")
-    where = Path(str(module.__file__)).parent
-    return Finding("ROS underlay", True, f"wheels, rclpy {wheel} in {where}")
+        hint = "source /opt/ros/jazzy/setup.bash, then '. ./env.sh'"
+        if not distribution:
+            hint = "run 'make setup', then '. ./env.sh'"
+        return Finding("ROS underlay", False, str(error).partition("\n")[0], hint)
+    kind = "distribution" if distribution else f"wheels, {importlib.metadata.version('ros-rclpy')}"
+    return Finding("ROS underlay", True, f"{kind}: {Path(str(module.__file__)).parent}")
 
 
 def interfaces() -> Finding:
