@@ -1,0 +1,221 @@
+"""`crash-coach plot`: learning curves and the coach's crash rate, of several runs and seeds."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from crash_coach_bringup.cli.curves import (
+    CURVES,
+    STEPS,
+    Curve,
+    Group,
+    average,
+    group_runs,
+    load_run,
+)
+from crash_coach_bringup.cli.output import (
+    CliError,
+    check_json_target,
+    console,
+    write_json,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FORMATS = ("png", "svg")
+TITLES = {
+    "success_rate": "success rate at the run's crash rate α (e_t)",
+    "success_crash_free": "success rate without crashes",
+    "return_mean": "mean return at the run's crash rate α",
+    "alpha": "nominal crash rate α per robot",
+}
+PROBABILITIES = {"success_rate", "success_crash_free"}
+# Okabe and Ito's palette, without its yellow, which is too light for a line.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+Dash = Literal["-", "--", "-.", ":"]
+DASHES: tuple[Dash, ...] = ("-", "--", "-.", ":")
+WIDE_LABEL = 50  # characters from which two columns of the legend would not fit
+INK = "#333333"
+
+Curves = dict[str, Curve | None]
+
+
+def draw(groups: Sequence[Group], curves: Sequence[Curves]) -> Figure:
+    """One panel per key of CURVES, one line per group; legend and notes below."""
+    # Imported here: no other verb should wait for it.
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+    rows = len(groups) + sum(note(group) is not None for group in groups)
+    figure = Figure(figsize=(10, 6.6 + 0.2 * rows), dpi=160, layout="constrained")
+    axes = figure.subplots(2, 2, sharex=True)
+    for ax, key in zip(axes.flat, CURVES, strict=True):
+        draw_panel(ax, key, groups, [each[key] for each in curves])
+    for ax in axes[-1]:
+        ax.set_xlabel("environment steps", color=INK)
+    handles = [
+        Line2D([], [], color=colour, linestyle=dash, label=legend(group))
+        for group, (colour, dash) in zip(groups, map(style, range(len(groups))), strict=True)
+    ]
+    wide = any(len(legend(group)) > WIDE_LABEL for group in groups)
+    columns = 1 if wide or len(groups) == 1 else 2
+    notes = [text for group in groups if (text := note(group))]
+    if notes:
+        figure.supxlabel("\n".join(["○ curve ends early", *notes]), fontsize=8, color=INK)
+    figure.legend(handles=handles, loc="outside upper center", ncols=columns, frameon=False)
+    return figure
+
+
+def style(index: int) -> tuple[str, Dash]:
+    """Colour and line style of a group."""
+    return COLOURS[index % len(COLOURS)], DASHES[index // len(COLOURS) % len(DASHES)]
+
+
+def draw_panel(ax: Any, key: str, groups: Sequence[Group], curves: Sequence[Curve | None]) -> None:
+    from matplotlib.ticker import EngFormatter
+
+    ax.grid(color="#dddddd", linewidth=0.6)
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.xaxis.set_major_formatter(EngFormatter(sep=""))
+    if key in PROBABILITIES:
+        ax.set_ylim(-0.03, 1.03)
+    missing = []
+    for index, (group, curve) in enumerate(zip(groups, curves, strict=True)):
+        if curve is None:
+            missing.append(group.label)
+            continue
+        colour, dash = style(index)
+        x, y = curve.env_steps, curve.mean
+        ax.plot(x, y, dash, color=colour, linewidth=1.5, zorder=3)
+        if curve.low is not None:
+            ax.fill_between(x, curve.low, curve.high, color=colour, alpha=0.2, linewidth=0)
+        if not group.finished:
+            ax.plot(x[-1:], y[-1:], "o", color=colour, markerfacecolor="white", zorder=4)
+    # In the title, where no curve can lie beneath it.
+    absent = f"\nnot measured: {', '.join(missing)}" if missing else ""
+    ax.set_title(TITLES[key] + absent, fontsize=11, color=INK)
+
+
+def legend(group: Group) -> str:
+    """'adaptive (5 seeds; band: 95 % bootstrap interval of the mean)'"""
+    if group.band is None:
+        return f"{group.label} (seed {group.runs[0].seed})"
+    return f"{group.label} (mean of {len(group.runs)} seeds; band: {group.band})"
+
+
+def note(group: Group) -> str | None:
+    """Which runs of a group are unfinished, and how far they are; None if all are finished."""
+    open_runs = [f"seed {run.seed} at {run.last_step:,}" for run in group.runs if not run.finished]
+    if not open_runs:
+        return None
+    return (
+        f"{group.label}: unfinished: {', '.join(open_runs)} of {group.runs[0].total_steps:,} steps"
+    )
+
+
+def save(figure: Figure, path: Path, kind: str) -> None:
+    """Writes ``path`` whole or not at all; the same curves give the same file.
+
+    Raises:
+        CliError: it cannot be written.
+    """
+    from matplotlib import rc_context
+
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    metadata = {"Date": None} if kind == "svg" else {}
+    try:
+        with rc_context({"svg.hashsalt": "crash-coach"}):
+            figure.savefig(partial, format=kind, metadata=metadata)
+        partial.replace(path)
+    except OSError as error:
+        raise CliError(f"--out: {path} cannot be written: {error.strerror}") from None
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def targets(stem: Path) -> dict[str, Path]:
+    """Format -> file. A stem that names one of the formats already is taken without it.
+
+    Raises:
+        CliError: the folder does not exist, or a directory is in the way.
+    """
+    name = stem.stem if stem.suffix[1:] in FORMATS else stem.name
+    if not name:
+        raise CliError(f"--out {stem}: a file name without suffix is needed, such as curves")
+    if not stem.absolute().parent.is_dir():
+        raise CliError(f"--out {stem}: there is no folder {stem.absolute().parent}")
+    found = {kind: stem.with_name(f"{name}.{kind}") for kind in FORMATS}
+    for path in found.values():
+        if path.is_dir():
+            raise CliError(f"--out {stem}: {path} is a directory")
+    return found
+
+
+def as_json(group: Group, curves: Curves) -> dict[str, Any]:
+    """What is drawn of a group, in figures; ``low`` and ``high`` are null for a single run."""
+    return {
+        "label": group.label,
+        "band": group.band,
+        "config": dict(group.runs[0].config),
+        "runs": [
+            {
+                "path": str(run.path),
+                "seed": run.seed,
+                STEPS: run.last_step,
+                "total_steps": run.total_steps,
+                "finished": run.finished,
+            }
+            for run in group.runs
+        ],
+        "curves": {key: curve and _curve_json(curve) for key, curve in curves.items()},
+    }
+
+
+def _curve_json(curve: Curve) -> dict[str, list[float] | None]:
+    return {
+        STEPS: curve.env_steps.tolist(),
+        "mean": curve.mean.tolist(),
+        "low": None if curve.low is None else curve.low.tolist(),
+        "high": None if curve.high is None else curve.high.tolist(),
+    }
+
+
+def plot(
+    runs: Annotated[
+        list[Path] | None, typer.Argument(metavar="RUN...", help="Run directories.")
+    ] = None,
+    out: Annotated[
+        Path, typer.Option(metavar="FILE_STEM", help="Writes FILE_STEM.png and FILE_STEM.svg.")
+    ] = Path("learning_curves"),
+    json: Annotated[Path | None, typer.Option(help="Also write the curves to this file.")] = None,
+) -> None:
+    """Draws learning curves; runs that differ in nothing but the seed share a line and a band."""
+    if not runs:
+        raise CliError("no run to plot: name at least one run directory, such as runs/qmix-s0")
+    check_json_target(json)
+    files = targets(out)
+    groups = group_runs([load_run(path) for path in runs])
+    curves: list[Curves] = [{key: average(group, key) for key in CURVES} for group in groups]
+    figure = draw(groups, curves)
+    for kind, path in files.items():
+        save(figure, path, kind)
+    for group in groups:
+        console.print(legend(group), markup=False, highlight=False, soft_wrap=True)
+        if text := note(group):
+            console.print(f"  {text}", markup=False, highlight=False, soft_wrap=True)
+    for path in files.values():
+        console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
+    pairs = zip(groups, curves, strict=True)
+    write_json(
+        json,
+        {
+            "files": [str(path) for path in files.values()],
+            "groups": [as_json(group, each) for group, each in pairs],
+        },
+    )

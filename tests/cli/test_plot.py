@@ -1,0 +1,247 @@
+"""`crash-coach plot`: curves read, grouped and averaged; pictures; damaged runs refused."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from crash_coach_bringup.cli.curves import (
+    BOOTSTRAP,
+    RANGE,
+    average,
+    bootstrap_mean,
+    group_runs,
+    load_run,
+)
+from crash_coach_bringup.cli.output import CliError
+from crash_coach_bringup.cli.plot import draw, legend, note, plot, targets
+from policy_pkg.train.config import TrainConfig
+from policy_pkg.train.run_dir import prepare_run
+from sim_pkg.contract import UserError
+
+STEPS = (0, 100, 200)
+
+
+def write_run(
+    folder: Path,
+    seed: int = 0,
+    success: Sequence[float | None] = (0.0, 0.5, 1.0),
+    steps: Sequence[int] = STEPS,
+    total_steps: int = 200,
+    algorithm: str = "qmix",
+) -> Path:
+    """A run directory as training leaves it."""
+    config = {"scenario": "buttons", "seed": seed, "total_steps": total_steps}
+    settings = TrainConfig.model_validate({**config, "learner": {"algorithm": algorithm}})
+    prepare_run(folder, settings, resume=False)
+    rows = [
+        {
+            "env_steps": step,
+            "success_rate": value,
+            "success_crash_free": None,
+            "return_mean": -20.0 + step,
+            "alpha": 0.25,
+        }
+        for step, value in zip(steps, success, strict=True)
+    ]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return folder
+
+
+def test_groups_by_config_without_seed(tmp_path: Path) -> None:
+    paths = [
+        write_run(tmp_path / "vdn-s7", 7, algorithm="vdn"),
+        write_run(tmp_path / "qmix-s2", 2),
+        write_run(tmp_path / "qmix-s1", 1),
+    ]
+    groups = group_runs([load_run(path) for path in paths])
+    assert [group.label for group in groups] == ["vdn", "qmix"]
+    assert [[run.seed for run in group.runs] for group in groups] == [[7], [1, 2]]
+    assert [group.band for group in groups] == [None, RANGE]
+
+
+def test_labels_that_clash_name_the_folder_above_or_the_path(tmp_path: Path) -> None:
+    one = write_run(tmp_path / "a" / "qmix-s0")
+    other = write_run(tmp_path / "b" / "qmix-s0", total_steps=300)
+    groups = group_runs([load_run(one), load_run(other)])
+    assert [group.label for group in groups] == ["a/qmix", "b/qmix"]
+    sibling = write_run(tmp_path / "a" / "qmix-s1", 1, total_steps=300)
+    groups = group_runs([load_run(one), load_run(sibling)])
+    assert [group.label for group in groups] == [str(one), str(sibling)]
+
+
+def test_the_same_run_twice_is_refused(tmp_path: Path) -> None:
+    run = load_run(write_run(tmp_path / "qmix-s3", 3))
+    with pytest.raises(CliError, match="same config and seed 3"):
+        group_runs([run, run])
+
+
+def test_single_run_is_drawn_as_it_is(tmp_path: Path) -> None:
+    (group,) = group_runs([load_run(write_run(tmp_path / "qmix-s0"))])
+    curve = average(group, "success_rate")
+    assert curve is not None
+    assert curve.env_steps.tolist() == [0, 100, 200]
+    assert curve.mean.tolist() == [0.0, 0.5, 1.0]
+    assert curve.low is None
+    assert curve.high is None
+
+
+def test_steps_that_differ_are_interpolated_as_far_as_all_runs_reach(tmp_path: Path) -> None:
+    long = write_run(tmp_path / "qmix-s0", 0, (0.0, 1.0, 1.0))
+    short = write_run(tmp_path / "qmix-s1", 1, (0.0, 1.0), steps=(0, 50))
+    (group,) = group_runs([load_run(long), load_run(short)])
+    curve = average(group, "success_rate")
+    assert curve is not None
+    assert curve.low is not None
+    assert curve.high is not None
+    assert curve.env_steps.tolist() == [0, 50]
+    # At step 50 the long run lies half way between 0 and 1.
+    assert curve.mean.tolist() == [0.0, 0.75]
+    assert curve.low.tolist() == [0.0, 0.5]
+    assert curve.high.tolist() == [0.0, 1.0]
+    assert not group.finished
+    assert note(group) == "qmix: unfinished: seed 1 at 50 of 200 steps"
+
+
+def test_points_that_were_not_measured(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "qmix-s0", success=(0.0, None, 1.0))
+    (group,) = group_runs([load_run(run)])
+    curve = average(group, "success_rate")
+    assert curve is not None
+    assert curve.env_steps.tolist() == [0, 200]
+    assert average(group, "success_crash_free") is None
+
+
+def test_five_seeds_get_a_bootstrap_interval(tmp_path: Path) -> None:
+    paths = [write_run(tmp_path / f"q-s{s}", s, (0.0, 0.2 * s, 1.0)) for s in range(5)]
+    (group,) = group_runs([load_run(path) for path in paths])
+    assert group.band == BOOTSTRAP
+    curve = average(group, "success_rate")
+    assert curve is not None
+    assert curve.low is not None
+    assert curve.high is not None
+    assert curve.mean == pytest.approx([0.0, 0.4, 1.0])
+    assert curve.low[[0, 2]] == pytest.approx([0.0, 1.0])
+    assert 0.0 < curve.low[1] < 0.4 < curve.high[1] < 0.8
+
+
+def test_bootstrap_agrees_with_the_normal_interval_of_many_seeds() -> None:
+    values = np.random.default_rng(5).normal(size=(400, 1))
+    low, high = bootstrap_mean(values)
+    error = values.std() / np.sqrt(len(values))
+    assert low[0] == pytest.approx(values.mean() - 1.96 * error, abs=0.2 * error)
+    assert high[0] == pytest.approx(values.mean() + 1.96 * error, abs=0.2 * error)
+    assert np.array_equal(bootstrap_mean(values), (low, high))
+
+
+def texts(figure: Any) -> str:
+    from matplotlib.text import Text
+
+    return "\n".join(text.get_text() for text in figure.findobj(Text))
+
+
+def test_figure_says_what_band_what_is_unfinished_and_not_measured(tmp_path: Path) -> None:
+    paths = [write_run(tmp_path / f"five-s{s}", s, total_steps=1000) for s in range(5)]
+    paths += [write_run(tmp_path / f"three-s{s}", s, algorithm="vdn") for s in range(3)]
+    groups = group_runs([load_run(path) for path in paths])
+    keys = ("success_rate", "success_crash_free", "return_mean", "alpha")
+    figure = draw(groups, [{key: average(group, key) for key in keys} for group in groups])
+    found = texts(figure)
+    assert f"five (mean of 5 seeds; band: {BOOTSTRAP})" in found
+    assert "three (mean of 3 seeds; band: min..max)" in found
+    assert "five: unfinished: seed 0 at 200, seed 1 at 200" in found
+    assert "three: unfinished" not in found
+    assert "not measured: five, three" in found
+    colours = [handle.get_color() for handle in figure.legends[0].get_lines()]
+    lines = figure.axes[0].get_lines()
+    # The unfinished group has a mark at its end beside its line.
+    assert [line.get_color() for line in lines] == [colours[0], colours[0], colours[1]]
+
+
+def test_writes_both_pictures_and_the_figures(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = [write_run(tmp_path / f"qmix-s{seed}", seed) for seed in range(2)]
+    stem, result = tmp_path / "v1.2", tmp_path / "curves.json"
+    plot(runs, stem, result)
+    png, svg = tmp_path / "v1.2.png", tmp_path / "v1.2.svg"
+    assert png.read_bytes().startswith(b"\x89PNG")
+    assert "</svg>" in svg.read_text()
+    shown = capsys.readouterr().out
+    assert f"wrote {png}" in shown
+    assert f"wrote {svg}" in shown
+    (group,) = json.loads(result.read_text())["groups"]
+    assert group["label"] == "qmix"
+    assert group["band"] == RANGE
+    assert [run["seed"] for run in group["runs"]] == [0, 1]
+    assert group["curves"]["success_crash_free"] is None
+    assert group["curves"]["alpha"]["mean"] == [0.25, 0.25, 0.25]
+    before = png.read_bytes(), svg.read_bytes()
+    plot(runs, stem)
+    assert (png.read_bytes(), svg.read_bytes()) == before
+    assert not list(tmp_path.glob("*.partial"))
+
+
+def test_out(tmp_path: Path) -> None:
+    assert targets(tmp_path / "a.png") == targets(tmp_path / "a")
+    with pytest.raises(CliError, match="there is no folder"):
+        targets(tmp_path / "missing" / "a")
+    (tmp_path / "b.svg").mkdir()
+    with pytest.raises(CliError, match=r"b\.svg is a directory"):
+        targets(tmp_path / "b")
+
+
+def test_label_of_a_single_run(tmp_path: Path) -> None:
+    (group,) = group_runs([load_run(write_run(tmp_path / "f1", 4))])
+    assert legend(group) == "f1 (seed 4)"
+    assert note(group) is None
+
+
+GOOD = '{"env_steps": 0, "success_rate": 0, "success_crash_free": 0, "return_mean": 0, "alpha": 0}'
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ("", "metrics.jsonl is empty"),
+        (GOOD + '\n{"env_steps": 10', r"metrics.jsonl:2: damaged line: .* at column"),
+        (GOOD + "\n\n", "metrics.jsonl:2: damaged line"),
+        ("[1]\n", "metrics.jsonl:1: damaged line: expected an object"),
+        ('{"env_steps": 0}\n', "metrics.jsonl:1: damaged line: success_rate is missing"),
+        (GOOD.replace('alpha": 0', 'alpha": NaN'), ":1: .* alpha is nan, not a finite number"),
+        (GOOD.replace('steps": 0', 'steps": null'), ":1: .* env_steps is None"),
+        (f"{GOOD}\n{GOOD}\n", r"metrics.jsonl:2: .* env_steps 0 does not exceed 0"),
+    ],
+)
+def test_damaged_metrics_name_file_and_line(tmp_path: Path, content: str, expected: str) -> None:
+    run = write_run(tmp_path / "qmix-s0")
+    (run / "metrics.jsonl").write_text(content)
+    with pytest.raises(UserError, match=expected) as caught:
+        load_run(run)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_run(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="holds no run"):
+        load_run(tmp_path)
+    run = write_run(tmp_path / "qmix-s0")
+    (run / "metrics.jsonl").unlink()
+    with pytest.raises(UserError, match=r"metrics\.jsonl is missing"):
+        load_run(run)
+    with pytest.raises(UserError, match="no run to plot"):
+        plot([])
+
+
+def test_other_verbs_do_not_load_matplotlib() -> None:
+    code = (
+        "import sys, crash_coach_bringup.cli.main;"
+        "sys.exit(any(name.split('.')[0] == 'matplotlib' for name in sys.modules))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
