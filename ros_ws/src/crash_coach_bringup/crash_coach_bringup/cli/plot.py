@@ -188,7 +188,7 @@ def _curve_json(curve: Curve) -> dict[str, list[float] | None]:
 
 def plot(
     runs: Annotated[
-        list[Path] | None, typer.Argument(metavar="RUN...", help="Run directories.")
+        list[Path] | None, typer.Argument(metavar="RUN", help="Run directories.")
     ] = None,
     out: Annotated[
         Path, typer.Option(metavar="FILE_STEM", help="Writes FILE_STEM.png and FILE_STEM.svg.")
