@@ -85,7 +85,7 @@ def request_reply_per_s(folder: Path) -> float:
     replier = Process("replier", (sys.executable, here, "reply"))
     with (
         reserve_domain() as domain,
-        Supervisor([replier], folder, graph_environment(domain)) as supervisor,
+        Supervisor([replier], folder, graph_environment(domain), throughput=True) as supervisor,
         graph_client("pinger", domain, lambda: refuse_dead(supervisor, 0.0)) as client,
     ):
         return Pinger(client).rate()
@@ -124,7 +124,10 @@ def lockstep_steps_per_s(folder: Path, robots: int, layout: Layout, gate: bool) 
     with (
         reserve_domain() as domain,
         Supervisor(
-            graph_processes(options, spec.robots), folder / "logs", graph_environment(domain)
+            graph_processes(options, spec.robots),
+            folder / "logs",
+            graph_environment(domain),
+            throughput=True,
         ) as supervisor,
         graph_client("meter", domain, lambda: refuse_dead(supervisor, 0.0)) as client,
     ):

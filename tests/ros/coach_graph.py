@@ -117,7 +117,7 @@ class Team:
         self.executor = EventsExecutor(context=self.context)
         self.executor.add_node(self.node)
         node = self.node
-        self._states = node.create_publisher(EpisodeState, "/sim/episode", EPISODE)
+        self._states = node.create_publisher(EpisodeState, "/sim/boundary", EPISODE)
         self._observations, self._raws = [], []
         for robot, name in enumerate(ROBOTS):
             self._observations.append(
@@ -170,7 +170,7 @@ class Team:
                     and n.count_publishers("/coach/events") > 0
                 )
             if coach:
-                ready = ready and n.count_subscribers("/sim/episode") > 0
+                ready = ready and n.count_subscribers("/sim/boundary") > 0
                 ready = ready and n.count_publishers("/coach/plan") > 0
             return ready
 

@@ -81,7 +81,7 @@ class CoachLink(Node):
         self._check = check
         self._due_s = 0.0
         self._plans = self.create_publisher(CrashPlanMessage, "/coach/plan", PLAN)
-        self.create_subscription(EpisodeState, "/sim/episode", self._on_episode, EPISODE, raw=True)
+        self.create_subscription(EpisodeState, "/sim/boundary", self._on_episode, EPISODE, raw=True)
         self.create_subscription(FaultEvent, "/coach/events", self._on_event, EVENTS)
         self.create_timer(TICK_S, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 

@@ -21,6 +21,8 @@ from sim_pkg.ros import convert
 from sim_pkg.session import Session
 
 EPISODE_TOPIC = "/sim/episode"
+# The same, only where an episode begins or ends: the coach need not wake at every step.
+BOUNDARY_TOPIC = "/sim/boundary"
 EVENTS_TOPIC = "/coach/events"
 _ACK_TIMEOUT_S = 2.0
 
@@ -55,6 +57,7 @@ class SimTopics:
         )
         pub = node.create_publisher
         self._episode_pub = pub(EpisodeState, EPISODE_TOPIC, latched)
+        self._boundary_pub = pub(EpisodeState, BOUNDARY_TOPIC, latched)
         self._clock_pub = pub(Clock, "/clock", _reliable(10))
         self._markers_pub = pub(MarkerArray, "/sim/markers", _reliable(10))
         self._diagnostics_pub = pub(DiagnosticArray, "/diagnostics", _reliable(10))
@@ -100,7 +103,9 @@ class SimTopics:
             self._episode_pub.publish(self._episode.fill(session))
         else:
             # A new episode: its plan takes longest. An ended one: nothing to observe.
-            self._episode_pub.publish(self._episode.fill(session))
+            state = self._episode.fill(session)
+            self._boundary_pub.publish(state)
+            self._episode_pub.publish(state)
             if session.running:
                 self._observations.fill(session)
                 self.publish_observations(range(self._spec.n_robots))

@@ -76,7 +76,8 @@ def evaluate_via_ros(
             coach = Coach(condition.crash, robots, seed)
         except ValueError as error:
             raise UserError(f"condition {condition.name!r}: {error}") from error
-        with Supervisor(graph_processes(options, robots), logs, graph_environment(domain)) as graph:
+        processes = graph_processes(options, robots)
+        with Supervisor(processes, logs, graph_environment(domain), throughput=True) as graph:
 
             def check() -> None:
                 for ended in graph.wait(0.0):

@@ -34,9 +34,10 @@ def run_up(options: UpOptions, on_event: Callable[[Event], None]) -> int:
     domain = domain_id(options)
     processes = graph_processes(options, check_team(options))
     refuse_second_sim(domain)
+    environment, lockstep = graph_environment(domain), options.mode == "lockstep"
     with (
         stop_signals() as interrupted,
-        Supervisor(processes, options.log_dir, graph_environment(domain)) as running,
+        Supervisor(processes, options.log_dir, environment, throughput=lockstep) as running,
     ):
         for name, pid in running.pids().items():
             on_event(Event("started", name, f"process {pid}, log {running.log_of(name)}"))
