@@ -169,9 +169,10 @@ def watch(
     """
     while not interrupted():
         ended = supervisor.wait(poll_s)
-        if any(e.name in last and e.exit_code == 0 for e in ended):
-            on_event(Event("finished", ", ".join(last), "all episodes are done"))
-            return 0
+        for e in ended:
+            if e.name in last and e.exit_code == 0:
+                on_event(Event("finished", e.name, "all episodes are done"))
+                return 0
         for e in ended:
             on_event(Event("died", e.name, e.describe()))
         if ended:
