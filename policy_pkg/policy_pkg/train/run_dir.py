@@ -94,7 +94,7 @@ def describe_run(config: TrainConfig) -> dict[str, Any]:
         },
         "machine": platform.machine(),
         "commit": _commit(),
-        "command": sys.argv,
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
     }
 
 
