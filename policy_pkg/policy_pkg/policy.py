@@ -38,6 +38,20 @@ class PolicySizes:
     hidden: int
 
 
+def weight_shapes(inputs: int, hidden: int, actions: int) -> dict[str, tuple[int, ...]]:
+    """Shape of each weight; ``inputs`` is observation + actions + robots."""
+    return {
+        "fc1.weight": (hidden, inputs),
+        "fc1.bias": (hidden,),
+        "rnn.weight_ih": (3 * hidden, hidden),
+        "rnn.weight_hh": (3 * hidden, hidden),
+        "rnn.bias_ih": (3 * hidden,),
+        "rnn.bias_hh": (3 * hidden,),
+        "fc2.weight": (actions, hidden),
+        "fc2.bias": (actions,),
+    }
+
+
 def check_weights(
     weights: dict[str, npt.NDArray[np.float32]], n_robots: int, n_actions: int
 ) -> PolicySizes:
@@ -53,17 +67,7 @@ def check_weights(
             f"actions + {n_robots} robots)"
         )
     hidden, inputs = first.shape
-    expected: dict[str, tuple[int, ...]] = {
-        "fc1.weight": (hidden, inputs),
-        "fc1.bias": (hidden,),
-        "rnn.weight_ih": (3 * hidden, hidden),
-        "rnn.weight_hh": (3 * hidden, hidden),
-        "rnn.bias_ih": (3 * hidden,),
-        "rnn.bias_hh": (3 * hidden,),
-        "fc2.weight": (n_actions, hidden),
-        "fc2.bias": (n_actions,),
-    }
-    for name, shape in expected.items():
+    for name, shape in weight_shapes(inputs, hidden, n_actions).items():
         if weights[name].shape != shape:
             raise ValueError(f"{name} has shape {weights[name].shape}, expected {shape}")
         if not np.isfinite(weights[name]).all():

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from policy_pkg.checkpoint import Manifest, write_checkpoint
+from policy_pkg.policy import weight_shapes
 from sim_pkg.contract import EnvSpec
 
 SCALE = 0.3  # wide enough that the action depends on observation and memory
@@ -20,19 +21,9 @@ def write_untrained(folder: Path, spec: EnvSpec, seed: int, hidden: int = 64) ->
     """
     rng = np.random.default_rng(seed)
     actions, inputs = spec.n_actions, spec.obs_size + spec.n_actions + spec.n_robots
-    shapes: dict[str, tuple[int, ...]] = {
-        "fc1.weight": (hidden, inputs),
-        "fc1.bias": (hidden,),
-        "rnn.weight_ih": (3 * hidden, hidden),
-        "rnn.weight_hh": (3 * hidden, hidden),
-        "rnn.bias_ih": (3 * hidden,),
-        "rnn.bias_hh": (3 * hidden,),
-        "fc2.weight": (actions, hidden),
-        "fc2.bias": (actions,),
-    }
     weights = {
         name: (SCALE * rng.standard_normal(shape)).astype(np.float32)
-        for name, shape in shapes.items()
+        for name, shape in weight_shapes(inputs, hidden, actions).items()
     }
     manifest = Manifest(
         scenario=spec.scenario,
