@@ -10,6 +10,7 @@ from numba import njit
 
 from sim_pkg.config import (
     ConfigError,
+    StrictModel,
     did_you_mean,
     find_scenario,
     load_tree,
@@ -81,6 +82,11 @@ class Env:
     def scene(self) -> Scene:
         """What can be drawn of the scenario."""
         return self._scenario.scene
+
+    @property
+    def config(self) -> StrictModel:
+        """The scenario's configuration, as read from its YAML."""
+        return self._scenario.config
 
     @property
     def n_arenas(self) -> int:

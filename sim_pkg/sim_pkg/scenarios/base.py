@@ -62,6 +62,11 @@ class Scenario(Protocol):
     world: WorldSpec
     scene: Scene
 
+    @property
+    def config(self) -> StrictModel:
+        """What the YAML said: scripted policies are built from it."""
+        ...
+
     def begin(self, arena: int, seed: int, episode: int) -> Float64Array:
         """Forgets ``arena``'s last episode; (d, 2) start positions in m of the new one."""
         ...

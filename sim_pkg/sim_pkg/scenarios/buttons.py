@@ -88,7 +88,7 @@ class Buttons:
 
     def __init__(self, config: ButtonsConfig, name: str, n_arenas: int) -> None:
         n, cell_m = len(config.starts), config.cell_m
-        self._config = config
+        self.config = config
         self._starts = np.array(config.starts, dtype=np.int32)
         self._buttons = np.array(config.buttons, dtype=np.int32)
         self._starts_m = self._centres(self._starts)
@@ -129,14 +129,14 @@ class Buttons:
     def command(
         self, running: BoolArray, actions: IntArray, bodies: Float64Array, commands: Float64Array
     ) -> None:
-        config = self._config
+        config = self.config
         _command(
             running, actions, MOVES, self._cells, config.rows, config.cell_m, config.dt_s,
             config.robot.max_speed_mps, bodies, commands,
         )  # fmt: skip
 
     def settle(self, running: BoolArray, bodies: Float64Array, out: Buffers) -> None:
-        config = self._config
+        config = self.config
         _read_cells(running, bodies, config.rows, config.columns, config.cell_m, self._cells)
         _score(
             running, self._cells, self._buttons, self._touched, self._steps,
@@ -145,13 +145,13 @@ class Buttons:
         self.observe(running, bodies, out)
 
     def _scale(self) -> tuple[float, float]:
-        return (float(self._config.rows - 1), float(self._config.columns - 1))
+        return (float(self.config.rows - 1), float(self.config.columns - 1))
 
     def _centres(self, cells: IntArray) -> Float64Array:
         """(k, 2) (row, column) -> (k, 2) x, y in m of the cells' centres."""
         row, column = cells[:, 0].astype(np.float64), cells[:, 1].astype(np.float64)
-        x = (column + 0.5) * self._config.cell_m
-        y = (self._config.rows - row - 0.5) * self._config.cell_m
+        x = (column + 0.5) * self.config.cell_m
+        y = (self.config.rows - row - 0.5) * self.config.cell_m
         return np.stack((x, y), axis=1)
 
     @staticmethod
