@@ -136,16 +136,16 @@ class Env:
         self._starting[:] = False
         for arena, episode in zip(which.tolist(), numbers.tolist(), strict=True):
             self._begin(arena, seed, episode)
-        self._scenario.observe(self._starting, self._world.bodies, self._out)
+        self._scenario.observe(self._starting, self._world, self._out)
         self._running |= self._starting
 
     def step(self, actions: IntArray) -> StepResult:
         """One control step of every running arena; see contract.BatchEnv.step."""
         out, running = self._out, self._running
         self._check(actions)
-        self._scenario.command(running, actions, self._world.bodies, self._world.commands)
+        self._scenario.command(running, actions, self._world)
         self._world.advance(running)
-        self._scenario.settle(running, self._world.bodies, out)
+        self._scenario.settle(running, self._world, out)
         running &= ~(out.terminated | out.truncated)
         return self._result
 

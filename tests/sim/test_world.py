@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pymunk
+import pytest
 from pymunk import batch
 
-from sim_pkg.world import SPARE_DOUBLES, DiscSpec, Float64Array, World, WorldSpec, box_walls
+from sim_pkg.world import (
+    SPARE_DOUBLES,
+    BoxSpec,
+    DiscSpec,
+    Float64Array,
+    World,
+    WorldSpec,
+    box_walls,
+)
 
 WALLS = box_walls(6.0, 6.0, 0.0, 0.5)
 SPEC = WorldSpec(
@@ -20,6 +31,15 @@ SPEC = WorldSpec(
     slop_m=0.01,
     penetration_left=0.001,
 )
+# The same, with limited drives (but for the last disc), a box, and speed-dependent resistance.
+HEAVY = replace(
+    SPEC,
+    discs=tuple(replace(d, drive_n=30.0 + i) for i, d in enumerate(SPEC.discs[:4]))
+    + SPEC.discs[4:],
+    boxes=(BoxSpec(1.2, 0.8, 20.0, 0.3, floor_arm_m=0.4),),
+    speed_left=0.4,
+)
+BOX_M = np.array([[3.0, 4.2]])
 STARTS_M = np.array([[1.0, 1.0], [2.0, 1.2], [3.0, 3.0], [4.2, 3.1], [2.5, 4.6]])
 
 
@@ -28,55 +48,118 @@ def commands(seed: int, steps: int) -> Float64Array:
 
 
 def run(world: World, arena: int, velocities: Float64Array) -> Float64Array:
+    """(steps, bodies, 4) of an episode; the floor holds a box with 20 to 60 N in turn."""
     running = np.zeros(len(world.bodies), dtype=np.bool_)
     running[arena] = True
-    world.place(arena, STARTS_M)
+    boxes = world.floor_n.shape[1]
+    world.place(arena, np.concatenate((STARTS_M, BOX_M[:boxes])))
     path = []
-    for command in velocities:
+    for step, command in enumerate(velocities):
         world.commands[arena] = command
+        world.floor_n[arena] = floor_n(step)
         world.advance(running)
-        path.append(world.bodies[arena].copy())
+        path.append(np.concatenate((world.bodies[arena], world.turns[arena]), axis=1))
     return np.array(path)
 
 
-def reference(velocities: Float64Array) -> Float64Array:
-    """The same scene on pymunk's public classes alone."""
-    space = pymunk.Space()
-    space.iterations, space.collision_slop, space.collision_bias = 10, 0.01, 0.001
-    for x1, y1, x2, y2 in WALLS:
-        wall = pymunk.Segment(space.static_body, (x1, y1), (x2, y2), 0.5)
-        wall.friction = 0.6
-        space.add(wall)
-    bodies = []
-    for disc, position in zip(SPEC.discs, STARTS_M.tolist(), strict=True):
-        body = pymunk.Body(disc.mass_kg, float("inf"))
-        body.position = position
-        shape = pymunk.Circle(body, disc.radius_m)
-        shape.friction = disc.friction
-        space.add(body, shape)
-        bodies.append(body)
-    path = []
-    for command in velocities.tolist():
-        for body, velocity in zip(bodies, command, strict=True):
-            body.velocity = velocity
-        for _ in range(4):
-            space.step(0.125)
-        path.append([(*b.position, *b.velocity) for b in bodies])
-    return np.array(path)
+def floor_n(step: int) -> float:
+    return 20.0 + 10.0 * (step % 5)
+
+
+class Reference:
+    """The same scenes on pymunk's public classes alone."""
+
+    def __init__(self, spec: WorldSpec) -> None:
+        self.space = space = pymunk.Space()
+        space.iterations, space.collision_slop, space.collision_bias = 10, 0.01, 0.001
+        space.damping = spec.speed_left
+        for x1, y1, x2, y2 in WALLS:
+            wall = pymunk.Segment(space.static_body, (x1, y1), (x2, y2), 0.5)
+            wall.friction = 0.6
+            space.add(wall)
+        self.bodies: list[pymunk.Body] = []
+        self.floors: list[tuple[pymunk.Constraint, pymunk.Constraint]] = []
+        for disc, position in zip(spec.discs, STARTS_M.tolist(), strict=True):
+            body = pymunk.Body(disc.mass_kg, float("inf"))
+            body.position = position
+            self.add(body, pymunk.Circle(body, disc.radius_m), disc.friction)
+        for box, position in zip(spec.boxes, BOX_M.tolist(), strict=False):
+            size = (box.width_m, box.height_m)
+            body = pymunk.Body(box.mass_kg, pymunk.moment_for_box(box.mass_kg, size))
+            body.position = position
+            self.add(body, pymunk.Poly.create_box(body, size), box.friction)
+            slide = pymunk.PivotJoint(space.static_body, body, (0, 0), (0, 0))
+            turn = pymunk.GearJoint(space.static_body, body, 0, 1)
+            self.floors.append((self.held(slide), self.held(turn)))
+        self.commanded = self.bodies[: len(spec.discs)]
+        for i, disc in enumerate(spec.discs):
+            if disc.drive_n < float("inf"):
+                motor = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
+                space.add(motor)
+                joint = pymunk.PivotJoint(motor, self.bodies[i], (0, 0), (0, 0))
+                self.held(joint).max_force = disc.drive_n
+                self.commanded[i] = motor
+
+    def add(self, body: pymunk.Body, shape: pymunk.Shape, friction: float) -> None:
+        shape.friction = friction
+        self.space.add(body, shape)
+        self.bodies.append(body)
+
+    def held(self, joint: pymunk.Constraint) -> pymunk.Constraint:
+        joint.max_bias = 0
+        self.space.add(joint)
+        return joint
+
+    def run(self, velocities: Float64Array) -> Float64Array:
+        path = []
+        for step, command in enumerate(velocities.tolist()):
+            for body, velocity in zip(self.commanded, command, strict=True):
+                body.velocity = velocity
+            for slide, turn in self.floors:
+                slide.max_force, turn.max_force = floor_n(step), 0.4 * floor_n(step)
+            for _ in range(4):
+                self.space.step(0.125)
+            path.append(
+                [(*b.position, *b.velocity, b.angle, b.angular_velocity) for b in self.bodies]
+            )
+        return np.array(path)
 
 
 def test_same_bits_as_pymunks_public_classes() -> None:
     """400 steps of colliding discs: equal in every bit to the documented API."""
     velocities = commands(0, 400)
     ours = run(World(SPEC, 1), 0, velocities)
-    np.testing.assert_array_equal(ours, reference(velocities))
+    np.testing.assert_array_equal(ours, Reference(SPEC).run(velocities))
     free = STARTS_M[None] + np.cumsum(velocities, axis=0) * 0.5
     assert np.abs(ours[:, :, :2] - free).max() > 1.0, "nothing ever collided: the test is void"
 
 
-def test_an_episode_does_not_depend_on_the_ones_before() -> None:
+def test_same_bits_with_limited_drives_and_a_box() -> None:
+    velocities = commands(7, 400)
+    ours = run(World(HEAVY, 1), 0, velocities)
+    np.testing.assert_array_equal(ours, Reference(HEAVY).run(velocities))
+    box = ours[:, 5]
+    assert np.ptp(box[:, :2], axis=0).max() > 0.5, "the box never moved: the test is void"
+    assert np.ptp(box[:, 4]) > 0.1, "the box never turned: the test is void"
+
+
+def test_the_floor_holds_what_is_pushed_with_less_force_than_its_own() -> None:
+    """One disc of 30 N against 31 N and 29 N of friction."""
+    spec = replace(HEAVY, discs=HEAVY.discs[:1], speed_left=1.0)
+    for friction_n, moves in ((31.0, False), (29.0, True)):
+        world = World(spec, 1)
+        world.place(0, np.array([[1.0, 3.0], [2.0, 3.0]]))
+        world.commands[0] = (2.0, 0.0)
+        world.floor_n[0] = friction_n
+        for _ in range(40):
+            world.advance(np.ones(1, dtype=np.bool_))
+        assert (world.bodies[0, 1, 0] > 2.3) == moves
+
+
+@pytest.mark.parametrize("spec", [SPEC, HEAVY])
+def test_an_episode_does_not_depend_on_the_ones_before(spec: WorldSpec) -> None:
     velocities = commands(1, 60)
-    world = World(SPEC, 3)
+    world = World(spec, 3)
     first = run(world, 1, velocities)
     for seed in (2, 3, 4):
         run(world, 1, commands(seed, 40))

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from sim_pkg.config import StrictModel
 from sim_pkg.contract import BoolArray, EnvSpec, FloatArray, IntArray, RewardArray
-from sim_pkg.world import Float64Array, WorldSpec
+from sim_pkg.world import Float64Array, World, WorldSpec
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,10 @@ class Buffers:
 
 
 class Scenario(Protocol):
-    """The rules of one task over B arenas. ``bodies`` and ``commands`` are World's."""
+    """The rules of one task over B arenas.
+
+    The hooks read the physics from ``World.bodies`` and write to ``World.commands``.
+    """
 
     spec: EnvSpec
     world: WorldSpec
@@ -71,17 +74,15 @@ class Scenario(Protocol):
         """Forgets ``arena``'s last episode; (d, 2) start positions in m of the new one."""
         ...
 
-    def observe(self, running: BoolArray, bodies: Float64Array, out: Buffers) -> None:
+    def observe(self, running: BoolArray, world: World, out: Buffers) -> None:
         """Fills obs, state, available and sites_done of the running arenas."""
         ...
 
-    def command(
-        self, running: BoolArray, actions: IntArray, bodies: Float64Array, commands: Float64Array
-    ) -> None:
+    def command(self, running: BoolArray, actions: IntArray, world: World) -> None:
         """Turns the running arenas' actions (B, n) into commanded velocities."""
         ...
 
-    def settle(self, running: BoolArray, bodies: Float64Array, out: Buffers) -> None:
+    def settle(self, running: BoolArray, world: World, out: Buffers) -> None:
         """After the physics: fills reward and flags of every arena (0 and False where it does
         not run), then observes."""
         ...

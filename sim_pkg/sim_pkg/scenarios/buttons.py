@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 from sim_pkg.config import StrictModel
 from sim_pkg.contract import BoolArray, EnvSpec, IntArray
 from sim_pkg.scenarios.base import Buffers, Kind, Scene, robot_names
-from sim_pkg.world import DiscSpec, Float64Array, WorldSpec, box_walls
+from sim_pkg.world import DiscSpec, Float64Array, World, WorldSpec, box_walls
 
 ACTIONS = ("up", "down", "left", "right", "stay")
 # (row, column) change of each action; row 0 is the northernmost.
@@ -122,27 +122,25 @@ class Buttons:
         self._steps[arena] = 0
         return self._starts_m
 
-    def observe(self, running: BoolArray, bodies: Float64Array, out: Buffers) -> None:
+    def observe(self, running: BoolArray, world: World, out: Buffers) -> None:
         _observe(running, self._cells, self._buttons, self._scale(), out.obs, out.state)
         out.sites_done[:] = self._touched
 
-    def command(
-        self, running: BoolArray, actions: IntArray, bodies: Float64Array, commands: Float64Array
-    ) -> None:
+    def command(self, running: BoolArray, actions: IntArray, world: World) -> None:
         config = self.config
         _command(
             running, actions, MOVES, self._cells, config.rows, config.cell_m, config.dt_s,
-            config.robot.max_speed_mps, bodies, commands,
+            config.robot.max_speed_mps, world.bodies, world.commands,
         )  # fmt: skip
 
-    def settle(self, running: BoolArray, bodies: Float64Array, out: Buffers) -> None:
+    def settle(self, running: BoolArray, world: World, out: Buffers) -> None:
         config = self.config
-        _read_cells(running, bodies, config.rows, config.columns, config.cell_m, self._cells)
+        _read_cells(running, world.bodies, config.rows, config.columns, config.cell_m, self._cells)
         _score(
             running, self._cells, self._buttons, self._touched, self._steps,
             config.episode_limit, self._rewards, out.reward, out.terminated, out.success,
         )  # fmt: skip
-        self.observe(running, bodies, out)
+        self.observe(running, world, out)
 
     def _scale(self) -> tuple[float, float]:
         return (float(self.config.rows - 1), float(self.config.columns - 1))
