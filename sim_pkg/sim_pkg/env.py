@@ -89,6 +89,11 @@ class Env:
         return self._scenario.config
 
     @property
+    def world(self) -> World:
+        """The physics; to be read only."""
+        return self._world
+
+    @property
     def n_arenas(self) -> int:
         return self._n_arenas
 

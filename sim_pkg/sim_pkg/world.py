@@ -60,6 +60,7 @@ class World:
     """B arenas with the same n discs, k boxes and walls.
 
     Attributes:
+        spec: what every arena contains.
         bodies: (B, n + k, 4) float64: x, y in m and vx, vy in m/s of each disc, then of each
             box, refreshed by ``place`` and ``advance``. Read only.
         turns: (B, n + k, 2) float64: angle in rad and angular velocity in rad/s of the same;
@@ -71,7 +72,7 @@ class World:
     """
 
     def __init__(self, spec: WorldSpec, n_arenas: int) -> None:
-        self._spec = spec
+        self.spec = spec
         n, k = len(spec.discs), len(spec.boxes)
         n_driven = sum(math.isfinite(disc.drive_n) for disc in spec.discs)
         self._commands_only = n_driven == k == 0  # every row but the static one is a command
@@ -102,7 +103,7 @@ class World:
         running: (B,); every running arena has been placed.
         """
         step, substep_s = lib.cpSpaceStep, self._substep_s
-        substeps = range(self._spec.substeps)
+        substeps = range(self.spec.substeps)
         for arena in np.flatnonzero(running).tolist():
             space = self._spaces[arena]
             self._order(space, arena)
@@ -118,7 +119,7 @@ class World:
             return
         self._write.transfer_to(parts.commanded, arena, _SET_ROW)
         for (slide, turn), box, force_n in zip(
-            parts.floors, self._spec.boxes, self.floor_n[arena].tolist(), strict=True
+            parts.floors, self.spec.boxes, self.floor_n[arena].tolist(), strict=True
         ):
             lib.cpConstraintSetMaxForce(slide, force_n)
             lib.cpConstraintSetMaxForce(turn, force_n * box.floor_arm_m)
@@ -130,7 +131,7 @@ class World:
 
     def _new_space(self, positions_m: list[tuple[float, float]]) -> tuple[Any, _Parts]:
         """A cpSpace that frees itself and its contents when it is no longer referenced."""
-        spec, n = self._spec, len(self._spec.discs)
+        spec, n = self.spec, len(self.spec.discs)
         space = lib.cpSpaceNew()
         lib.cpSpaceSetIterations(space, spec.iterations)
         lib.cpSpaceSetCollisionSlop(space, spec.slop_m)
