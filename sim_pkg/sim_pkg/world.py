@@ -46,14 +46,16 @@ _ALL_CATEGORIES = 0xFFFFFFFF
 
 @dataclass(frozen=True)
 class _Parts:
-    """What of a Space is written to before every control step.
+    """What of a Space is written to before the physics advances, or taken out.
 
     ``commanded``: per disc the cpBody that takes its commanded velocity, itself or its drive.
     ``floors``: per box the joints of the floor's friction against sliding and turning.
+    ``hulls``: per disc the shape that collides.
     """
 
     commanded: list[Any]
     floors: list[tuple[Any, Any]]
+    hulls: list[Any]
 
 
 class World:
@@ -80,7 +82,7 @@ class World:
         self._substep_s = spec.dt_s / spec.substeps
         self._walls = [((x1, y1), (x2, y2)) for x1, y1, x2, y2 in spec.walls_m]
         self._spaces: list[Any] = [None] * n_arenas
-        self._parts: list[_Parts] = [_Parts([], [])] * n_arenas
+        self._parts: list[_Parts] = [_Parts([], [], [])] * n_arenas
         self._read = _Rows(n_arenas, rows * _READ_WIDTH, _READ)
         self._write = _Rows(n_arenas, rows * _WRITE_WIDTH, _WRITE)
         self._turn = _Rows(n_arenas, rows * _TURN_WIDTH, _TURN) if k else None
@@ -97,8 +99,15 @@ class World:
         self._spaces[arena] = space
         self._report(space, arena)
 
+    def take_out(self, arena: int, disc: int) -> None:
+        """From now on to the episode's end the disc collides with nothing.
+
+        It keeps its row, and moves as commanded: command 0 to leave it where it is.
+        """
+        lib.cpSpaceRemoveShape(self._spaces[arena], self._parts[arena].hulls[disc])
+
     def advance(self, running: npt.NDArray[np.bool_]) -> None:
-        """Drives the discs of the running arenas at ``commands`` for one control step.
+        """Drives the discs of the running arenas at ``commands`` for ``spec.dt_s``.
 
         running: (B,); every running arena has been placed.
         """
@@ -140,14 +149,14 @@ class World:
         build = _Builder(space)
         for start, end in self._walls:
             build.wall(start, end, spec.wall_radius_m, spec.wall_friction)
-        discs = [build.disc(d, at) for d, at in zip(spec.discs, positions_m[:n], strict=True)]
+        made = [build.disc(d, at) for d, at in zip(spec.discs, positions_m[:n], strict=True)]
         floors = [build.box(b, at) for b, at in zip(spec.boxes, positions_m[n:], strict=True)]
         # The drives come last, so that the rows of discs and boxes are as World says.
         commanded = [
             build.drive(body, disc.drive_n) if math.isfinite(disc.drive_n) else body
-            for body, disc in zip(discs, spec.discs, strict=True)
+            for (body, _), disc in zip(made, spec.discs, strict=True)
         ]
-        return ffi.gc(space, build.free), _Parts(commanded, floors)
+        return ffi.gc(space, build.free), _Parts(commanded, floors, [hull for _, hull in made])
 
 
 class _Builder:
@@ -166,14 +175,15 @@ class _Builder:
         shape = lib.cpSegmentShapeNew(self._floor, start, end, radius_m)
         self._add_shape(shape, friction)
 
-    def disc(self, disc: DiscSpec, position_m: tuple[float, float]) -> Any:
+    def disc(self, disc: DiscSpec, position_m: tuple[float, float]) -> tuple[Any, Any]:
+        """Its body and its shape."""
         # An infinite moment: the robots keep their heading (omnidirectional drive).
         body = self._add_body(lib.cpBodyNew(disc.mass_kg, np.inf))
         lib.cpBodySetPosition(body, position_m)
         shape = lib.cpCircleShapeNew(body, disc.radius_m, (0.0, 0.0))
         lib.cpShapeSetFilter(shape, (disc.group, _ALL_CATEGORIES, _ALL_CATEGORIES))
         self._add_shape(shape, disc.friction)
-        return body
+        return body, shape
 
     def box(self, box: BoxSpec, position_m: tuple[float, float]) -> tuple[Any, Any]:
         """The joints by which the floor resists sliding and turning.

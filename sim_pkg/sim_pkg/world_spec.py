@@ -38,7 +38,7 @@ class BoxSpec:
 
 @dataclass(frozen=True)
 class WorldSpec:
-    """What every arena contains and how it is integrated.
+    """What every arena contains and how it is integrated: ``dt_s`` at a time, in ``substeps``.
 
     ``walls_m``: (x1, y1, x2, y2) of each wall's middle line; ``wall_radius_m`` is half its
     thickness. ``penetration_left`` is the share of a penetration that is left after a second,
