@@ -27,6 +27,17 @@ class ConfigError(UserError):
     """A configuration that cannot be used; the text says where, what, and what is right."""
 
 
+class Misplaced(ValueError):
+    """For a model's checks of several keys together: what is wrong, and below which key.
+
+    ``location`` leads from the model that checks to the key or item that is to blame.
+    """
+
+    def __init__(self, location: _Location, text: str) -> None:
+        super().__init__(text)
+        self.location = location
+
+
 class StrictModel(BaseModel):
     """Base of every configuration: frozen, no unknown key, no NaN, no infinity."""
 
@@ -147,6 +158,9 @@ def _index_lines(
 def _describe(tree: YamlTree, model: type[BaseModel], problem: dict[str, Any]) -> str:
     location: _Location = problem["loc"]
     name = ".".join(str(part) for part in location) or "the file"
+    cause = problem.get("ctx", {}).get("error")
+    if isinstance(cause, Misplaced):
+        return f"{tree.where((*location, *cause.location))}: {cause}"
     where = tree.where(location)
     if problem["type"] == "extra_forbidden":
         known = _known_keys(model, location[:-1])
