@@ -25,13 +25,13 @@ from sim_pkg.contract import (
     IntArray,
     StepResult,
 )
-from sim_pkg.scenarios import buttons
+from sim_pkg.scenarios import buttons, coverage
 from sim_pkg.scenarios.base import Buffers, Kind, Scenario, Scene
 from sim_pkg.world import Float64Array, World
 
 __all__ = ["KINDS", "Env", "make_env", "scenario_names"]
 
-KINDS: dict[str, Kind] = {"buttons": buttons.KIND}
+KINDS: dict[str, Kind] = {"buttons": buttons.KIND, "coverage": coverage.KIND}
 """The kinds of scenario by the ``kind`` key of their YAML; add your own here."""
 
 

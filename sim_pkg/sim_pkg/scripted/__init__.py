@@ -1,5 +1,8 @@
 """Scripted policies by name; see base.py."""
 
-from sim_pkg.scripted.base import ScriptedPolicy, make_scripted, scripted_names
+from sim_pkg.scripted import coverage
+from sim_pkg.scripted.base import REGISTRY, ScriptedPolicy, make_scripted, scripted_names
 
 __all__ = ["ScriptedPolicy", "make_scripted", "scripted_names"]
+
+REGISTRY.update(coverage.ENTRIES)

@@ -1,0 +1,128 @@
+"""What transport and coverage share: robots that are driven with limited force, in 9 actions."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from numba import njit
+from pydantic import Field
+
+from sim_pkg.config import StrictModel
+from sim_pkg.world import DiscSpec, box_walls
+
+ACTIONS = (
+    "stay", "east", "north_east", "north", "north_west", "west", "south_west", "south",
+    "south_east",
+)  # fmt: skip
+STAY = 0
+_D = np.sqrt(0.5)
+# Unit vector (x, y) of each action.
+DIRECTIONS = np.array(
+    [(0, 0), (1, 0), (_D, _D), (0, 1), (-_D, _D), (-1, 0), (-_D, -_D), (0, -1), (_D, -_D)]
+)
+WALL_RADIUS_M = 0.5
+# Robots and boxes overlap by at most this when at rest against each other.
+SLOP_M = 0.005
+# Share of an overlap that is left after a second.
+PENETRATION_LEFT = 1e-6
+
+Metres = Annotated[float, Field(gt=0, le=1000)]
+Point = tuple[Annotated[float, Field(ge=0, le=1000)], Annotated[float, Field(ge=0, le=1000)]]
+
+
+class RobotConfig(StrictModel):
+    radius_m: Metres
+    mass_kg: float = Field(gt=0)
+    friction: float = Field(ge=0, le=1)
+    max_speed_mps: float = Field(gt=0)
+    max_force_n: float = Field(gt=0)
+
+    def disc(self) -> DiscSpec:
+        return DiscSpec(self.radius_m, self.mass_kg, self.friction, drive_n=self.max_force_n)
+
+
+class PhysicsConfig(StrictModel):
+    substeps: int = Field(ge=4, le=1000)
+    iterations: int = Field(ge=1, le=1000)
+
+
+def walls(arena_m: Point) -> tuple[tuple[float, float, float, float], ...]:
+    """Four walls whose inner faces are the arena's edges."""
+    return box_walls(*arena_m, 0.0, WALL_RADIUS_M)
+
+
+def check_starts(
+    starts: tuple[Point, ...], arena_m: Point, jitter_m: float, radius_m: float
+) -> None:
+    """Refuses robots that could start in a wall or in each other.
+
+    Raises:
+        ValueError: naming the start and what is right.
+    """
+    check_inside("starts", starts, arena_m, radius_m + jitter_m)
+    apart_m = 2 * (radius_m + np.sqrt(2.0) * jitter_m)
+    for i, first in enumerate(starts):
+        for second in starts[:i]:
+            if np.hypot(first[0] - second[0], first[1] - second[1]) < apart_m:
+                raise ValueError(
+                    f"starts: {list(second)} and {list(first)} may overlap; with this radius and "
+                    f"start_jitter_m, starts must be at least {apart_m:.3g} m apart"
+                )
+
+
+def check_inside(key: str, points: tuple[Point, ...], arena_m: Point, margin_m: float) -> None:
+    """Refuses points that are nearer to a wall than ``margin_m``.
+
+    Raises:
+        ValueError: naming the point and what is right.
+    """
+    for point in points:
+        if any(
+            not margin_m <= x <= size - margin_m for x, size in zip(point, arena_m, strict=True)
+        ):
+            raise ValueError(
+                f"{key}: {list(point)} is too near to a wall; at least {margin_m:g} m from the "
+                f"edges of the {arena_m[0]:g} x {arena_m[1]:g} m arena"
+            )
+
+
+@njit(cache=True)
+def steer(running, actions, directions, speed_mps, commands):  # type: ignore[no-untyped-def]
+    """Actions (B, n) as commanded velocities: full speed in the action's direction, or none."""
+    for b in range(actions.shape[0]):
+        if running[b]:
+            for i in range(actions.shape[1]):
+                for k in range(2):
+                    commands[b, i, k] = speed_mps * directions[actions[b, i], k]
+
+
+@njit(cache=True)
+def clip(value):  # type: ignore[no-untyped-def]
+    """To [-1, 1]: an overlap of a millimetre, or a knock, must not leave the declared bounds."""
+    return min(max(value, -1.0), 1.0)
+
+
+@njit(cache=True)
+def write_robots(bodies, arena_m, speed_mps, out):  # type: ignore[no-untyped-def]
+    """x, y in [-1, 1] over the arena and vx, vy over the top speed, of each robot, into ``out``."""
+    for i in range(out.shape[0] // 4):
+        for k in range(2):
+            out[4 * i + k] = clip(2.0 * bodies[i, k] / arena_m[k] - 1.0)
+            out[4 * i + 2 + k] = clip(bodies[i, 2 + k] / speed_mps)
+
+
+@njit(cache=True)
+def write_others(bodies, n, i, sight_m, out):  # type: ignore[no-untyped-def]
+    """Per other robot, in index order: seen, dx, dy over ``sight_m``; zeros where unseen."""
+    at = 0
+    for j in range(n):
+        if j == i:
+            continue
+        dx = (bodies[j, 0] - bodies[i, 0]) / sight_m
+        dy = (bodies[j, 1] - bodies[i, 1]) / sight_m
+        seen = dx * dx + dy * dy <= 1.0
+        out[at] = 1.0 if seen else 0.0
+        out[at + 1] = dx if seen else 0.0
+        out[at + 2] = dy if seen else 0.0
+        at += 3
