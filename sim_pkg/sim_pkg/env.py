@@ -25,13 +25,18 @@ from sim_pkg.contract import (
     IntArray,
     StepResult,
 )
-from sim_pkg.scenarios import buttons, coverage
+from sim_pkg.scenarios import buttons, coverage, skirmish, transport
 from sim_pkg.scenarios.base import Buffers, Kind, Scenario, Scene
 from sim_pkg.world import Float64Array, World
 
 __all__ = ["KINDS", "Env", "make_env", "scenario_names"]
 
-KINDS: dict[str, Kind] = {"buttons": buttons.KIND, "coverage": coverage.KIND}
+KINDS: dict[str, Kind] = {
+    "buttons": buttons.KIND,
+    "coverage": coverage.KIND,
+    "skirmish": skirmish.KIND,
+    "transport": transport.KIND,
+}
 """The kinds of scenario by the ``kind`` key of their YAML; add your own here."""
 
 
@@ -67,7 +72,10 @@ class Env:
         self._n_arenas = n_arenas
         self._world = World(scenario.world, n_arenas)
         self._positions_m = self._world.bodies[:, : scenario.spec.n_robots, :2]
-        self._out = Buffers.allocate(scenario.spec, len(scenario.scene.sites_m), n_arenas)
+        self._advances = round(scenario.spec.dt_s / scenario.world.dt_s)
+        self._out = Buffers.allocate(
+            scenario.spec, len(scenario.scene.sites_m), len(scenario.world.discs), n_arenas
+        )
         self._running = np.zeros(n_arenas, dtype=np.bool_)
         self._starting = np.zeros(n_arenas, dtype=np.bool_)
         self._result = StepResult(
@@ -124,6 +132,11 @@ class Env:
         return self._out.sites_done
 
     @property
+    def hits(self) -> FloatArray:
+        """(B, d, d) how much health and shield disc i took from disc j in the last step."""
+        return self._out.hits
+
+    @property
     def running(self) -> BoolArray:
         """(B,) arenas whose episode has started and not ended."""
         return self._running
@@ -148,8 +161,9 @@ class Env:
         """One control step of every running arena; see contract.BatchEnv.step."""
         out, running = self._out, self._running
         self._check(actions)
-        self._scenario.command(running, actions, self._world)
-        self._world.advance(running)
+        for _ in range(self._advances):
+            self._scenario.command(running, actions, self._world)
+            self._world.advance(running)
         self._scenario.settle(running, self._world, out)
         running &= ~(out.terminated | out.truncated)
         return self._result
@@ -162,6 +176,7 @@ class Env:
         if seed < 0 or episode < 0:
             raise ValueError(f"seed {seed} and episode {episode} must not be negative")
         self._starting[arena] = True
+        self._out.hits[arena] = 0.0
         self._world.place(arena, self._scenario.begin(arena, seed, episode))
 
     def _check(self, actions: IntArray) -> None:

@@ -14,6 +14,19 @@ from sim_pkg.contract import FloatArray
 from sim_pkg.env import make_env
 
 
+class AvailableActions(spaces.Discrete):
+    """All of a robot's actions; what is sampled without a mask is available at present."""
+
+    def __init__(self, n: int) -> None:
+        super().__init__(n)
+        self.available: npt.NDArray[np.int8] = np.ones(n, dtype=np.int8)
+
+    def sample(self, mask: Any | None = None, probability: Any | None = None) -> np.int64:
+        if mask is None and probability is None:
+            mask = self.available
+        return super().sample(mask, probability)
+
+
 class ParallelArena(ParallelEnv[str, FloatArray, int]):
     """A scenario with one arena.
 
@@ -43,9 +56,7 @@ class ParallelArena(ParallelEnv[str, FloatArray, int]):
         self._obs_spaces: dict[str, spaces.Space[Any]] = {
             robot: spaces.Box(low, high, (spec.obs_size,), np.float32) for robot in spec.robots
         }
-        self._action_spaces: dict[str, spaces.Space[Any]] = {
-            robot: spaces.Discrete(spec.n_actions) for robot in spec.robots
-        }
+        self._action_spaces = {robot: AvailableActions(spec.n_actions) for robot in spec.robots}
         self.state_space = spaces.Box(low, high, (spec.state_size,), np.float32)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
@@ -110,4 +121,6 @@ class ParallelArena(ParallelEnv[str, FloatArray, int]):
 
     def _infos(self) -> dict[str, dict[str, Any]]:
         masks: npt.NDArray[np.int8] = self._env.available[0].astype(np.int8)
+        for i, robot in enumerate(self.possible_agents):
+            self._action_spaces[robot].available = masks[i]
         return {robot: {"action_mask": masks[i]} for i, robot in enumerate(self.agents)}

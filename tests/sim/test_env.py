@@ -95,7 +95,8 @@ def test_bounds_masks_and_shapes(name: str) -> None:
             for seen in (env.obs, env.state):
                 assert seen.min() >= spec.bounds[0]
                 assert seen.max() <= spec.bounds[1]
-            env.step(rng.integers(0, spec.n_actions, (3, spec.n_robots)).astype(np.int32))
+            scores = rng.random(env.available.shape) * env.available
+            env.step(scores.argmax(axis=-1).astype(np.int32))
 
 
 @pytest.fixture

@@ -42,9 +42,10 @@ class Buffers:
     truncated: BoolArray  # (B,)
     success: BoolArray  # (B,)
     sites_done: BoolArray  # (B, m)
+    hits: FloatArray  # (B, d, d) what disc i took from disc j in the last step; 0: no hits here
 
     @classmethod
-    def allocate(cls, spec: EnvSpec, n_sites: int, n_arenas: int) -> Buffers:
+    def allocate(cls, spec: EnvSpec, n_sites: int, n_discs: int, n_arenas: int) -> Buffers:
         n, b = spec.n_robots, n_arenas
         return cls(
             obs=np.zeros((b, n, spec.obs_size), dtype=np.float32),
@@ -55,6 +56,7 @@ class Buffers:
             truncated=np.zeros(b, dtype=np.bool_),
             success=np.zeros(b, dtype=np.bool_),
             sites_done=np.zeros((b, n_sites), dtype=np.bool_),
+            hits=np.zeros((b, n_discs, n_discs), dtype=np.float32),
         )
 
 
@@ -82,7 +84,11 @@ class Scenario(Protocol):
         ...
 
     def command(self, running: BoolArray, actions: IntArray, world: World) -> None:
-        """Turns the running arenas' actions (B, n) into commanded velocities."""
+        """Turns the running arenas' actions (B, n) into commanded velocities.
+
+        Called before every advance of the physics: more than once in a control step, with the
+        same actions, where ``world.dt_s`` is a part of ``spec.dt_s``.
+        """
         ...
 
     def settle(self, running: BoolArray, world: World, out: Buffers) -> None:

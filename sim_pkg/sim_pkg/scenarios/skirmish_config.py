@@ -1,0 +1,191 @@
+"""What a skirmish map and a unit type may say, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationInfo, field_validator, model_validator
+
+from sim_pkg.config import Misplaced, StrictModel, did_you_mean, load_yaml_strict
+from sim_pkg.scenarios.skirmish_layout import Layout
+
+UNITS_FILE = Path(__file__).parent.parent / "configs" / "units.yaml"
+
+TICK_S = 1 / 16  # StarCraft II's game loop at its "Normal" speed
+PHASES = 2  # how often in a control step velocities are commanded anew
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Point = tuple[float, float]
+
+
+class UnitConfig(StrictModel):
+    """A unit type; units.yaml says what each key means."""
+
+    health: Positive
+    shield: NotNegative
+    shield_per_s: NotNegative
+    shield_after_s: NotNegative
+    armour: NotNegative
+    armoured: bool
+    radius_m: Positive
+    body_radius_m: Positive
+    mass_kg: Positive
+    friction: float = Field(ge=0, le=1)
+    speed_mps: Positive
+    damage: Positive
+    damage_to_armoured: NotNegative
+    reach_m: Positive
+    cooldown_s: float = Field(ge=4 * TICK_S)
+    hits_s: tuple[NotNegative, ...] = Field(min_length=1, max_length=8)
+
+    @field_validator("hits_s")
+    @classmethod
+    def _in_order(cls, hits_s: tuple[float, ...], info: ValidationInfo) -> tuple[float, ...]:
+        if list(hits_s) != sorted(hits_s):
+            raise ValueError("an attack's hits must be in order of time")
+        # An attack is over before the next one starts, whose cooldown may be a tick shorter.
+        longest = info.data.get("cooldown_s", math.inf) - 2 * TICK_S
+        if hits_s[-1] > longest:
+            raise ValueError(f"the last hit must land within the cooldown, at most at {longest:g}")
+        return hits_s
+
+
+class UnitTypes(StrictModel):
+    unit_types: dict[str, UnitConfig] = Field(min_length=1)
+
+
+class PlacedUnit(StrictModel):
+    unit: str
+    start_m: Point
+
+
+class BehaviourConfig(StrictModel):
+    acquire_m: Positive
+    help_m: NotNegative
+    leash_m: Positive
+
+
+class PhysicsConfig(StrictModel):
+    substeps: int = Field(ge=4, le=1000, multiple_of=PHASES)
+    iterations: int = Field(ge=1, le=1000)
+
+
+class SkirmishConfig(StrictModel):
+    """A map; the shipped ones say what each key means.
+
+    ``unit_types``: the map's own types, next to those of units.yaml.
+    """
+
+    kind: Literal["skirmish"]
+    dt_s: float = Field(gt=0, le=10)
+    episode_limit: int = Field(ge=1, le=100_000)
+    arena_m: tuple[Positive, Positive]
+    free_m: tuple[NotNegative, NotNegative, Positive, Positive]
+    robots: tuple[PlacedUnit, ...] = Field(min_length=1, max_length=64)
+    opponents: tuple[PlacedUnit, ...] = Field(min_length=1, max_length=64)
+    behaviour: BehaviourConfig
+    physics: PhysicsConfig
+    unit_types: dict[str, UnitConfig] = Field(default_factory=dict)
+
+    @property
+    def placed(self) -> tuple[PlacedUnit, ...]:
+        """Robots, then opponents."""
+        return self.robots + self.opponents
+
+    @property
+    def types(self) -> dict[str, UnitConfig]:
+        """Every unit type that the map may use."""
+        return shipped_units() | self.unit_types
+
+    @property
+    def units(self) -> tuple[UnitConfig, ...]:
+        """The type of each placed unit."""
+        types = self.types
+        return tuple(types[placed.unit] for placed in self.placed)
+
+    @property
+    def layout(self) -> Layout:
+        robots = [placed.unit for placed in self.robots]
+        opponents = [placed.unit for placed in self.opponents]
+        shielded = [name for name, unit in self.types.items() if unit.shield > 0]
+        return Layout.of(robots, opponents, shielded)
+
+    @field_validator("dt_s")
+    @classmethod
+    def _whole_phases(cls, dt_s: float) -> float:
+        if not (dt_s / (PHASES * TICK_S)).is_integer():
+            raise ValueError(f"must be a multiple of {PHASES * TICK_S}")
+        return dt_s
+
+    @model_validator(mode="after")
+    def _check(self) -> SkirmishConfig:
+        west, south, east, north = self.free_m
+        if not (west < east <= self.arena_m[0] and south < north <= self.arena_m[1]):
+            raise Misplaced(
+                ("free_m",),
+                f"free_m = {list(self.free_m)}: no rectangle x1, y1, x2, y2 in the arena, "
+                f"which is {self.arena_m[0]:g} x {self.arena_m[1]:g} m",
+            )
+        types = shipped_units()
+        for name in self.unit_types:
+            if name in types:
+                raise Misplaced(
+                    ("unit_types", name), f"unit_types.{name}: {UNITS_FILE.name} has that name"
+                )
+        self._check_units()
+        self._check_starts()
+        return self
+
+    def _places(self) -> Iterator[tuple[tuple[str, int], PlacedUnit]]:
+        for team in ("robots", "opponents"):
+            for index, placed in enumerate(getattr(self, team)):
+                yield (team, index), placed
+
+    def _check_units(self) -> None:
+        types = self.types
+        for (team, index), placed in self._places():
+            if placed.unit not in types:
+                raise Misplaced(
+                    (team, index, "unit"),
+                    f"{team}.{index}.unit = {placed.unit!r}: unknown unit type"
+                    f"{did_you_mean(placed.unit, types)}; known: {', '.join(types)}",
+                )
+
+    def _check_starts(self) -> None:
+        west, south, east, north = self.free_m
+        units, before = self.units, list[tuple[str, PlacedUnit, float]]()
+        for ((team, index), placed), unit in zip(self._places(), units, strict=True):
+            (x, y), radius = placed.start_m, unit.body_radius_m
+            name = f"{team}.{index}.start_m = [{x:g}, {y:g}]"
+            inside_x = west + radius <= x <= east - radius
+            if not (inside_x and south + radius <= y <= north - radius):
+                raise Misplaced(
+                    (team, index, "start_m"),
+                    f"{name}: outside the walls, where the other team cannot reach it; x must be "
+                    f"in {west + radius:g}..{east - radius:g}, "
+                    f"y in {south + radius:g}..{north - radius:g}",
+                )
+            for other_name, other, other_radius in before:
+                gap = math.dist(placed.start_m, other.start_m)
+                if gap < radius + other_radius:
+                    raise Misplaced(
+                        (team, index, "start_m"),
+                        f"{name}: overlaps {other_name}, {gap:g} m away; at least "
+                        f"{radius + other_radius:g} is needed",
+                    )
+            before.append((f"{team}.{index}", placed, radius))
+
+
+@cache
+def shipped_units() -> dict[str, UnitConfig]:
+    """The unit types of units.yaml.
+
+    Raises:
+        ConfigError: the file is wrong.
+    """
+    return load_yaml_strict(UNITS_FILE, UnitTypes).unit_types

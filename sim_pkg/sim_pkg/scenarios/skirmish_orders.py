@@ -1,0 +1,279 @@
+"""Compiled: what every unit is told and how fast it goes, once per phase of a control step.
+
+Before the physics of a phase each unit gets a velocity: to the point it was ordered to, or
+towards its target until that is within reach. Whoever has something in the way goes around it, on
+one side until the way is free. Then everyone brakes: Chipmunk notices two discs only when they
+overlap already, up to a substep's way deep, so as in engines with speculative contacts (Bullet,
+Box2D) no pair may come closer in a phase than touching. Nobody is pushed away by that.
+
+Shapes and columns as in skirmish_tables.py.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from sim_pkg.scenarios.skirmish_layout import FIRST_ATTACK, MOVE_M, STOP
+from sim_pkg.scenarios.skirmish_tables import (
+    ALIVE,
+    ATTACK,
+    BODY_RADIUS_M,
+    GO,
+    HALT,
+    HITTER,
+    LAST_ACTION,
+    NEXT_HIT,
+    OLD_X,
+    OLD_Y,
+    ORDER,
+    POINT_X,
+    POINT_Y,
+    SIDE,
+    SPEED_MPS,
+    TARGET,
+    WAIT,
+)
+
+# North, south, east, west.
+WAYS = np.array([(0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0)])
+
+SLACK_M = 0.02  # a chaser aims this far inside its reach
+WATCH_M = 0.35  # what is nearer than this, edge to edge, can be in the way
+AHEAD = 0.5  # cosine of the angle within which it is
+SAME_PACE = 0.8  # what goes the same way at this share of one's speed is not in the way
+BRAKE_PASSES = 3
+
+
+@njit(cache=True)
+def take_orders(running, actions, bodies, real, whole):  # type: ignore[no-untyped-def]
+    """The robots' actions (B, n) as orders. An attack that has not hit yet is broken off by any
+    other order, and may start again at once."""
+    n = actions.shape[1]
+    for b in range(actions.shape[0]):
+        if not running[b]:
+            continue
+        for i in range(n):
+            action = actions[b, i]
+            unit = whole[b, i]
+            unit[LAST_ACTION] = action
+            if not unit[ALIVE]:
+                continue
+            target = -1
+            if action == STOP:
+                unit[ORDER] = HALT
+            elif action < FIRST_ATTACK:
+                unit[ORDER] = GO
+                way = WAYS[action - STOP - 1]
+                real[b, i, POINT_X] = bodies[b, i, 0] + MOVE_M * way[0]
+                real[b, i, POINT_Y] = bodies[b, i, 1] + MOVE_M * way[1]
+            else:
+                unit[ORDER] = ATTACK
+                target = n + action - FIRST_ATTACK
+            if target != unit[TARGET] and unit[NEXT_HIT] == 0:
+                unit[NEXT_HIT] = -1
+                real[b, i, WAIT] = 0.0
+            unit[TARGET] = target
+
+
+@njit(cache=True)
+def drive(  # type: ignore[no-untyped-def]
+    running, n, phase_s, bodies, units, reach, acquire, leash, help_m, free, goal, real, whole,
+    commands,
+):  # fmt: skip
+    """The opponents choose their targets; then everyone's velocity for the next phase."""
+    for b in range(bodies.shape[0]):
+        if not running[b]:
+            continue
+        _choose_targets(n, bodies[b], acquire, leash, help_m, goal, real[b], whole[b])
+        for i in range(units.shape[0]):
+            real[b, i, OLD_X] = bodies[b, i, 0]
+            real[b, i, OLD_Y] = bodies[b, i, 1]
+            vx, vy = _wish(i, phase_s, bodies[b], units, reach, real[b], whole[b])
+            commands[b, i, 0] = vx
+            commands[b, i, 1] = vy
+        _brake(phase_s, bodies[b], units, free, whole[b], commands[b])
+
+
+@njit(cache=True)
+def _choose_targets(n, bodies, acquire, leash, help_m, goal, real, whole):  # type: ignore[no-untyped-def]
+    """Attack-move: each opponent keeps its target while it can, else looks for one."""
+    d = whole.shape[0]
+    for j in range(n, d):
+        if not whole[j, ALIVE]:
+            continue
+        target = whole[j, TARGET]
+        if target >= 0 and (
+            not whole[target, ALIVE] or _distance(bodies, j, target) > leash[j, target]
+        ):
+            target = -1
+        if target < 0:
+            target = _look_around(n, j, bodies, acquire, help_m, whole)
+        whole[j, TARGET] = target
+        if target >= 0:
+            whole[j, ORDER] = ATTACK
+        else:
+            whole[j, ORDER] = GO
+            real[j, POINT_X] = goal[0]
+            real[j, POINT_Y] = goal[1]
+    for j in range(n, d):
+        whole[j, HITTER] = -1
+
+
+@njit(cache=True)
+def _look_around(n, j, bodies, acquire, help_m, whole):  # type: ignore[no-untyped-def]
+    """The nearest robot within j's range, else one that hit j or a neighbour of j; -1: none."""
+    best, nearest = np.inf, -1
+    for i in range(n):
+        if whole[i, ALIVE]:
+            distance = _distance(bodies, i, j)
+            if distance <= acquire[j, i] and distance < best:
+                best, nearest = distance, i
+    if nearest >= 0:
+        return nearest
+    best = np.inf
+    for k in range(n, whole.shape[0]):
+        hitter = whole[k, HITTER]
+        if hitter >= 0 and whole[hitter, ALIVE]:
+            distance = _distance(bodies, j, k)
+            if distance <= help_m and distance < best:
+                best, nearest = distance, hitter
+    return nearest
+
+
+@njit(cache=True)
+def _wish(i, phase_s, bodies, units, reach, real, whole):  # type: ignore[no-untyped-def]
+    """The velocity with which unit i would follow its order if it were alone but for detours."""
+    order = whole[i, ORDER]
+    if not whole[i, ALIVE] or order == HALT or whole[i, NEXT_HIT] == 0:
+        return 0.0, 0.0
+    target = -1
+    if order == GO:
+        dx, dy = real[i, POINT_X] - bodies[i, 0], real[i, POINT_Y] - bodies[i, 1]
+    else:
+        target = whole[i, TARGET]
+        dx, dy = bodies[target, 0] - bodies[i, 0], bodies[target, 1] - bodies[i, 1]
+    distance = np.sqrt(dx * dx + dy * dy)
+    if distance < 1e-6:
+        return 0.0, 0.0
+    dx /= distance
+    dy /= distance
+    way = distance
+    if target >= 0:
+        # What the target runs away in this phase has to be caught up too.
+        away = bodies[target, 2] * dx + bodies[target, 3] * dy
+        way = distance - reach[i, target] + max(away, 0.0) * phase_s
+        if way <= 0.0:
+            whole[i, SIDE] = 0
+            return 0.0, 0.0
+        way += SLACK_M
+    speed = min(units[i, SPEED_MPS], way / phase_s)
+    dx, dy = _around(i, target, dx, dy, speed, bodies, units, whole)
+    return speed * dx, speed * dy
+
+
+@njit(cache=True)
+def _around(i, target, dx, dy, speed, bodies, units, whole):  # type: ignore[no-untyped-def]
+    """The direction (dx, dy), or along the edge of the unit that is in the way."""
+    blocker, most = -1, AHEAD
+    for k in range(whole.shape[0]):
+        if k == i or not whole[k, ALIVE]:
+            continue
+        if k == target:
+            continue
+        x, y = bodies[k, 0] - bodies[i, 0], bodies[k, 1] - bodies[i, 1]
+        near = units[i, BODY_RADIUS_M] + units[k, BODY_RADIUS_M] + WATCH_M
+        if abs(x) > near or abs(y) > near:
+            continue
+        distance = np.sqrt(x * x + y * y)
+        if distance > near or distance < 1e-6:
+            continue
+        ahead = (x * dx + y * dy) / distance
+        pace = bodies[k, 2] * dx + bodies[k, 3] * dy
+        if ahead > most and pace < SAME_PACE * speed:
+            blocker, most = k, ahead
+    if blocker < 0:
+        whole[i, SIDE] = 0
+        return dx, dy
+    x, y = bodies[blocker, 0] - bodies[i, 0], bodies[blocker, 1] - bodies[i, 1]
+    distance = np.sqrt(x * x + y * y)
+    x /= distance
+    y /= distance
+    if whole[i, SIDE] == 0:
+        # The side on which less of the way is blocked; straight ahead, every other unit left.
+        cross = dx * y - dy * x
+        if abs(cross) > 1e-6:
+            whole[i, SIDE] = 1 if cross < 0.0 else -1
+        else:
+            whole[i, SIDE] = 1 if i % 2 == 0 else -1
+    side = whole[i, SIDE]
+    return -side * y, side * x
+
+
+@njit(cache=True)
+def _brake(phase_s, bodies, units, free, whole, commands):  # type: ignore[no-untyped-def]
+    """Slows approaching pairs so that, if they keep their velocities, they just touch."""
+    d = units.shape[0]
+    for _ in range(BRAKE_PASSES):
+        changed = False
+        _brake_at_walls(phase_s, bodies, units, free, commands)
+        for i in range(d):
+            if not whole[i, ALIVE]:
+                continue
+            for k in range(i + 1, d):
+                if whole[k, ALIVE] and _brake_pair(i, k, phase_s, bodies, units, commands):
+                    changed = True
+        if not changed:
+            return
+    _brake_at_walls(phase_s, bodies, units, free, commands)
+
+
+@njit(cache=True)
+def _brake_pair(i, k, phase_s, bodies, units, commands):  # type: ignore[no-untyped-def]
+    """Whether i and k had to brake: along the line between them, in proportion to what each
+    contributes to the approach."""
+    x, y = bodies[k, 0] - bodies[i, 0], bodies[k, 1] - bodies[i, 1]
+    touch = units[i, BODY_RADIUS_M] + units[k, BODY_RADIUS_M]
+    far = touch + (units[i, SPEED_MPS] + units[k, SPEED_MPS]) * phase_s
+    square = x * x + y * y
+    if square > far * far or square < 1e-12:
+        return False
+    vx, vy = commands[k, 0] - commands[i, 0], commands[k, 1] - commands[i, 1]
+    closing = -(vx * x + vy * y)
+    if closing <= 1e-12:
+        return False
+    distance = np.sqrt(square)
+    if distance > touch:
+        when = min(phase_s, closing / (vx * vx + vy * vy))
+        nx, ny = x + when * vx, y + when * vy
+        if nx * nx + ny * ny >= touch * touch:
+            return False
+    x /= distance
+    y /= distance
+    mine = commands[i, 0] * x + commands[i, 1] * y
+    theirs = -(commands[k, 0] * x + commands[k, 1] * y)
+    spare = max(distance - touch, 0.0) / phase_s - (mine + theirs)
+    if spare >= -1e-9:
+        return False
+    total = max(mine, 0.0) + max(theirs, 0.0)
+    for who, part, sign in ((i, max(mine, 0.0), 1.0), (k, max(theirs, 0.0), -1.0)):
+        slower = sign * spare * part / total
+        commands[who, 0] += slower * x
+        commands[who, 1] += slower * y
+    return True
+
+
+@njit(cache=True)
+def _brake_at_walls(phase_s, bodies, units, free, commands):  # type: ignore[no-untyped-def]
+    for i in range(units.shape[0]):
+        radius = units[i, BODY_RADIUS_M]
+        for axis in range(2):
+            low = min(free[axis] + radius - bodies[i, axis], 0.0) / phase_s
+            high = max(free[axis + 2] - radius - bodies[i, axis], 0.0) / phase_s
+            commands[i, axis] = min(max(commands[i, axis], low), high)
+
+
+@njit(cache=True)
+def _distance(bodies, i, k):  # type: ignore[no-untyped-def]
+    x, y = bodies[k, 0] - bodies[i, 0], bodies[k, 1] - bodies[i, 1]
+    return np.sqrt(x * x + y * y)
