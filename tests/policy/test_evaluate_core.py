@@ -14,11 +14,13 @@ from policy_pkg.train.episode import Sizes
 from policy_pkg.train.evaluate import (
     Condition,
     Evaluation,
+    Scripted,
     at_rate,
     crash_free,
     evaluate,
     exactly,
     named,
+    record_episode,
 )
 from policy_pkg.train.learner import Learner
 from policy_pkg.train.learner_config import LearnerConfig
@@ -80,15 +82,28 @@ def test_who_crashes_is_what_the_condition_says(policy: RecurrentPolicy) -> None
     assert sum(map(len, drawn)) / 400 == pytest.approx(0.5, abs=0.08)
 
 
-def test_a_muted_robot_stays_where_it_is(policy: RecurrentPolicy) -> None:
-    run = evaluate(policy, SCENARIO, named(["robot_2"]), 2, 7, record_positions=True)
-    for episode in run.episodes:
-        assert episode.positions_m is not None
-        assert episode.positions_m.shape == (episode.steps + 1, 2, 2)
-        np.testing.assert_allclose(
-            episode.positions_m[:, 1] - episode.positions_m[0, 1], 0, atol=1e-6
-        )
-    assert evaluate(policy, SCENARIO, crash_free(), 1, 7).episodes[0].positions_m is None
+def test_a_recorded_episode_is_the_evaluated_one(policy: RecurrentPolicy) -> None:
+    condition = named(["robot_2"])
+    evaluated = evaluate(policy, SCENARIO, condition, 3, 7).episodes[2]
+    frames = record_episode(policy, SCENARIO, condition, 2, 7)
+    assert frames.trajectory_hash == evaluated.trajectory_hash
+    assert (frames.episode, frames.steps) == (2, evaluated.steps)
+    assert frames.returns[-1] == evaluated.episode_return
+    assert frames.success == evaluated.success
+    assert frames.faulted == evaluated.crashed == (1,)
+    assert frames.positions_m.shape == (evaluated.steps + 1, 2, 2)
+    assert np.ptp(frames.positions_m[:, 0], axis=0).max() > 0.9
+    np.testing.assert_allclose(frames.positions_m[:, 1], [[8.5, 2.5]] * (frames.steps + 1))
+
+
+def test_scripted_teams_are_evaluated_alike() -> None:
+    runs = [evaluate(Scripted("random"), SCENARIO, at_rate(0.3), 9, 5, k) for k in (1, 4)]
+    assert runs[0] == runs[1]
+    assert len({e.trajectory_hash for e in runs[0].episodes}) == 9
+    held = evaluate(Scripted("hold"), SCENARIO, crash_free(), 2, 5)
+    assert {e.steps for e in held.episodes} == {20}
+    with pytest.raises(ConfigError, match=r"unknown scripted policy 'randon'.*did you mean"):
+        evaluate(Scripted("randon"), SCENARIO, crash_free(), 1, 0)
 
 
 def test_the_same_seed_pairs_methods(policy: RecurrentPolicy, spec: EnvSpec) -> None:

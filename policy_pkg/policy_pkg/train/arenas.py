@@ -10,11 +10,10 @@ import numpy.typing as npt
 
 from crash_coach_pkg.gate import apply_faults
 from crash_coach_pkg.plan import CrashPlan
-from policy_pkg.policy import RecurrentPolicy
+from policy_pkg.train.teams import Team
 from sim_pkg.contract import (
     BatchEnv,
     EpisodeArray,
-    FloatArray,
     IntArray,
     StepResult,
     stay_action,
@@ -38,7 +37,7 @@ class Arenas:
 
     Args:
         env: its arenas are this object's alone.
-        policy: its weights may change between steps.
+        team: told which episodes start; its weights may change between steps.
         plan: the crash plan of an episode, asked when the episode starts.
         seed: of the environment; with the episode's number it determines the episode.
     """
@@ -46,13 +45,13 @@ class Arenas:
     def __init__(
         self,
         env: BatchEnv,
-        policy: RecurrentPolicy,
+        team: Team,
         plan: Callable[[int], CrashPlan],
         seed: int,
     ) -> None:
         self.env = env
         self.spec = env.spec
-        self._policy = policy
+        self._team = team
         self._plan = plan
         self._seed = seed
         arenas, robots = env.n_arenas, env.spec.n_robots
@@ -60,14 +59,12 @@ class Arenas:
         self.episodes: EpisodeArray = np.zeros(arenas, dtype=np.int64)
         self.running = np.zeros(arenas, dtype=np.bool_)
         self.plans: list[CrashPlan | None] = [None] * arenas
-        self.hidden = policy.initial_hidden(arenas * robots)
         self.last_action: IntArray = np.full((arenas, robots), -1, dtype=np.int32)
         # One step more than an episode has: an arena that ended and waits is at its last step + 1.
         limit = env.spec.episode_limit + 1
         self._modes: ModeArray = np.zeros((arenas, limit, robots), dtype=np.uint8)
         self._crash_seed = 0
         self._index = np.arange(arenas)
-        self._robot: IntArray = np.tile(np.arange(robots, dtype=np.int32), arenas)
 
     def start(self, arenas: ArenaArray, episodes: EpisodeArray) -> None:
         """Starts ``episodes[i]`` in ``arenas[i]`` under the crash plan of that episode."""
@@ -83,7 +80,7 @@ class Arenas:
         self.episodes[arenas] = episodes
         self.running[arenas] = True
         self.last_action[arenas] = -1
-        self.hidden.reshape(self.env.n_arenas, -1)[arenas] = 0.0
+        self._team.begin(arenas, self._seed, episodes)
         for arena, plan in zip(arenas, plans, strict=True):
             self.plans[arena] = plan
             self._crash_seed = plan.seed
@@ -94,17 +91,6 @@ class Arenas:
         for fault in plan.faults:
             end = fault.start_step + fault.duration_steps if fault.duration_steps else None
             self._modes[arena, fault.start_step : end, fault.robot] = fault.mode
-
-    def values(self) -> FloatArray:
-        """(B, n, A) the policy's action values; advances its hidden states by one step."""
-        arenas, robots = self.last_action.shape
-        q, self.hidden = self._policy.forward(
-            self.env.obs.reshape(arenas * robots, -1),
-            self.last_action.reshape(-1),
-            self._robot,
-            self.hidden,
-        )
-        return q.reshape(arenas, robots, -1)
 
     def execute(self, intent: IntArray) -> Executed:
         """Applies the faults to (B, n) intended actions and advances every running arena."""

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from crash_coach_pkg.coach import Coach
 from crash_coach_pkg.config import CoachConfig
 from crash_coach_pkg.plan import CrashPlan
-from policy_pkg.act import greedy
 from policy_pkg.checkpoint import PolicyBundle
 from policy_pkg.policy import RecurrentPolicy
 from policy_pkg.train.arenas import ArenaArray, Arenas, Executed
 from policy_pkg.train.statistics import wilson
+from policy_pkg.train.teams import RecurrentTeam, ScriptedTeam, Team
 from sim_pkg.contract import BatchEnv, UserError
-from sim_pkg.env import make_env
+from sim_pkg.env import Env, make_env
+from sim_pkg.frames import Frames, Recorder
+from sim_pkg.scripted import make_scripted
 from sim_pkg.trajectory import TrajectoryHash, combine
 
 
@@ -66,7 +67,6 @@ class EpisodeResult:
     steps: int
     crashed: tuple[int, ...]  # indexes of the robots that the plan faults
     trajectory_hash: str
-    positions_m: npt.NDArray[np.float32] | None = None  # (T+1, n, 2), where it was asked for
 
 
 @dataclass(frozen=True)
@@ -103,14 +103,20 @@ class Evaluation:
         }
 
 
+@dataclass(frozen=True)
+class Scripted:
+    """A policy of sim_pkg.scripted, by its name."""
+
+    name: str
+
+
 def evaluate(
-    target: PolicyBundle | RecurrentPolicy,
+    target: PolicyBundle | RecurrentPolicy | Scripted,
     scenario: str | Path,
     condition: Condition,
     episodes: int,
     seed: int,
     n_arenas: int = 32,
-    record_positions: bool = False,
 ) -> Evaluation:
     """Plays episodes 0 .. ``episodes`` - 1 greedily; equal arguments give equal episodes.
 
@@ -119,35 +125,48 @@ def evaluate(
 
     Raises:
         CheckpointError: the policy does not fit the scenario.
-        ConfigError: unknown or wrong scenario.
+        ConfigError: unknown or wrong scenario, or a scripted policy that does not play it.
         UserError: ``episodes`` or the condition cannot be used with this scenario.
     """
     if episodes < 1:
         raise UserError(f"episodes = {episodes}: at least 1 is needed")
     env = make_env(scenario, max(1, min(n_arenas, episodes)))
-    if isinstance(target, PolicyBundle):
-        target.check_spec(env.spec)
-    policy = target.policy if isinstance(target, PolicyBundle) else target
-    return evaluate_in(env, policy, condition, range(episodes), seed, record_positions)
+    run = _Run(env, _team(target, env), condition, seed)
+    return run.evaluation(range(episodes))
 
 
 def evaluate_in(
-    env: BatchEnv,
-    policy: RecurrentPolicy,
-    condition: Condition,
-    episodes: range,
-    seed: int,
-    record_positions: bool = False,
+    env: BatchEnv, policy: RecurrentPolicy, condition: Condition, episodes: range, seed: int
 ) -> Evaluation:
     """As ``evaluate``, in an environment that nothing else uses, for any range of episodes."""
-    robots = env.spec.robots
-    try:
-        coach = Coach(condition.crash, robots, seed)
-    except ValueError as error:
-        raise UserError(f"condition {condition.name!r}: {error}") from error
-    run = _Run(env, policy, coach, seed, record_positions)
-    results = run.play(episodes)
-    return Evaluation(condition.name, robots, seed, tuple(results))
+    return _Run(env, RecurrentTeam(policy, env), condition, seed).evaluation(episodes)
+
+
+def record_episode(
+    target: PolicyBundle | RecurrentPolicy | Scripted,
+    scenario: str | Path,
+    condition: Condition,
+    episode: int,
+    seed: int,
+) -> Frames:
+    """Plays one episode as ``evaluate`` does, and keeps what can be drawn of it.
+
+    Raises:
+        As ``evaluate``.
+    """
+    env = make_env(scenario, 1)
+    run = _Run(env, _team(target, env), condition, seed, lambda k: Recorder(env, 0, seed, k))
+    (result,) = run.evaluation(range(episode, episode + 1)).episodes
+    return run.recorders[0].finish(result.success, result.trajectory_hash)
+
+
+def _team(target: PolicyBundle | RecurrentPolicy | Scripted, env: Env) -> Team:
+    if isinstance(target, Scripted):
+        return ScriptedTeam(make_scripted(target.name, env), env)
+    if isinstance(target, PolicyBundle):
+        target.check_spec(env.spec)
+        target = target.policy
+    return RecurrentTeam(target, env)
 
 
 class _Run:
@@ -156,32 +175,40 @@ class _Run:
     def __init__(
         self,
         env: BatchEnv,
-        policy: RecurrentPolicy,
-        coach: Coach,
+        team: Team,
+        condition: Condition,
         seed: int,
-        record_positions: bool,
+        recorder: Callable[[int], Recorder] | None = None,
     ) -> None:
+        try:
+            coach = Coach(condition.crash, env.spec.robots, seed)
+        except ValueError as error:
+            raise UserError(f"condition {condition.name!r}: {error}") from error
         self._env = env
+        self._team = team
+        self._condition = condition
         self._seed = seed
-        self._record_positions = record_positions
-        self._arenas = Arenas(env, policy, coach.plan, seed)
+        self._arenas = Arenas(env, team, coach.plan, seed)
         self._hashes: dict[int, TrajectoryHash] = {}
         self._returns = np.zeros(env.n_arenas, dtype=np.float64)
-        self._positions: dict[int, list[npt.NDArray[np.float32]]] = {}
+        self._recorder = recorder
+        self.recorders: dict[int, Recorder] = {}  # by arena, where a recorder was given
 
-    def play(self, episodes: range) -> list[EpisodeResult]:
+    def evaluation(self, episodes: range) -> Evaluation:
+        """Plays and sums up."""
         waiting = list(episodes)
         free: ArenaArray = np.arange(self._env.n_arenas)
         results: list[EpisodeResult] = []
         while waiting or self._arenas.running.any():
             self._start(free[: len(waiting)], waiting)
-            intent = greedy(self._arenas.values(), self._env.available)
+            intent = self._team.act(self._env.obs, self._env.available, self._arenas.last_action)
             self._observe()
             done = self._arenas.execute(intent)
             self._account(done)
             free = self._arenas.count_step(done.result)
             results += [self._result(int(arena), done) for arena in free]
-        return sorted(results, key=lambda result: result.episode)
+        results.sort(key=lambda result: result.episode)
+        return Evaluation(self._condition.name, self._env.spec.robots, self._seed, tuple(results))
 
     def _start(self, arenas: ArenaArray, waiting: list[int]) -> None:
         """Takes as many episodes off ``waiting`` as there are arenas for them."""
@@ -191,34 +218,31 @@ class _Run:
         self._returns[arenas] = 0.0
         for arena, episode in zip(arenas.tolist(), episodes, strict=True):
             self._hashes[arena] = TrajectoryHash(self._seed, episode)
-            self._positions[arena] = []
+            if self._recorder is not None:
+                self.recorders[arena] = self._recorder(episode)
 
     def _observe(self) -> None:
         obs, state = self._env.obs, self._env.state
         for arena in np.flatnonzero(self._arenas.running).tolist():
             self._hashes[arena].observe(obs[arena], state[arena])
-            self._note_position(arena)
-
-    def _note_position(self, arena: int) -> None:
-        if self._record_positions:
-            self._positions[arena].append(self._env.positions_m[arena].copy())
 
     def _account(self, done: Executed) -> None:
         result = done.result
         for arena in np.flatnonzero(self._arenas.running).tolist():
-            self._returns[arena] += result.reward[arena]
+            reward = float(result.reward[arena])
+            self._returns[arena] += reward
             self._hashes[arena].act(
                 done.actions[arena],
-                float(result.reward[arena]),
+                reward,
                 bool(result.terminated[arena]),
                 bool(result.truncated[arena]),
                 bool(result.success[arena]),
             )
+            if arena in self.recorders:
+                self.recorders[arena].step(done.modes[arena] != 0, reward)
 
     def _result(self, arena: int, done: Executed) -> EpisodeResult:
-        self._note_position(arena)
         plan = self._arenas.plans[arena]
-        positions = self._positions[arena]
         return EpisodeResult(
             episode=int(self._arenas.episodes[arena]),
             success=bool(done.result.success[arena]),
@@ -226,7 +250,6 @@ class _Run:
             steps=int(self._arenas.steps[arena]),
             crashed=_faulted(plan),
             trajectory_hash=self._hashes[arena].hexdigest(),
-            positions_m=np.stack(positions) if positions else None,
         )
 
 

@@ -15,6 +15,7 @@ from policy_pkg.checkpoint import CheckpointError
 from policy_pkg.policy import RecurrentPolicy
 from policy_pkg.train.arenas import ArenaArray, Arenas, ModeArray
 from policy_pkg.train.episode import Episode
+from policy_pkg.train.teams import RecurrentTeam
 from sim_pkg.contract import BatchEnv, StepResult
 
 Array = npt.NDArray[Any]
@@ -53,7 +54,8 @@ class Rollout:
     ) -> None:
         self._env = env
         self._rng = rng
-        self._arenas = Arenas(env, policy, plan, seed)
+        self._team = RecurrentTeam(policy, env)
+        self._arenas = Arenas(env, self._team, plan, seed)
         self._next_episode = 0
         self._waiting: ArenaArray = np.arange(env.n_arenas)
         self._index = np.arange(env.n_arenas)
@@ -77,7 +79,7 @@ class Rollout:
             The episodes that it ended, in ascending order of their arenas.
         """
         self._start_waiting()
-        q = self._arenas.values()
+        q = self._team.values(self._env.obs, self._arenas.last_action)
         intent = epsilon_greedy(q, self._env.available, epsilon, self._rng)
         self._record_before()
         done = self._arenas.execute(intent)
@@ -136,7 +138,7 @@ class Rollout:
         arrays = {
             "steps": np.where(arenas.running, arenas.steps, -1),
             "actions": self._actions,
-            "hidden": arenas.hidden,
+            "hidden": self._team.hidden,
             "obs": np.ascontiguousarray(self._env.obs),
         }
         plans = [None if p is None else plan_to_json(p) for p in arenas.plans]
@@ -158,7 +160,7 @@ class Rollout:
                 f"scenario {self._env.spec.scenario!r} does not repeat the episodes under way in "
                 "this checkpoint: it was changed, or this is another version or machine type"
             )
-        self._arenas.hidden = arrays["hidden"].copy()
+        self._team.hidden = arrays["hidden"].copy()
         self._waiting = np.flatnonzero(steps < 0)
         self._next_episode = int(values["next_episode"])
         self._rng.bit_generator.state = values["rng"]

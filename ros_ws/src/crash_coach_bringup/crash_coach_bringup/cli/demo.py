@@ -52,7 +52,6 @@ def run_graphs(out: Path, episodes: int, seed: int, layout: Layout) -> Results:
                 episodes,
                 seed,
                 layout.value,
-                record_positions=True,
             )
             results.setdefault(method, []).append((condition, result))
     return results
@@ -106,10 +105,14 @@ def demo(
     results = run_graphs(out, episodes, seed, layout)
     show(results, episodes)
     picture = out / "trajectories.png"
-    from crash_coach_bringup.cli.picture import draw_first_episodes
+    # Imported here: matplotlib takes its time.
+    from crash_coach_bringup.cli.picture import TeamResults, draw_first_episodes
 
     draw_first_episodes(
-        {TITLES[method]: (COLOURS[method], found) for method, found in results.items()},
+        [
+            TeamResults(TITLES[method], COLOURS[method], load_policy(out / method), found)
+            for method, found in results.items()
+        ],
         load_policy(out / "qmix").scenario,
         picture,
     )

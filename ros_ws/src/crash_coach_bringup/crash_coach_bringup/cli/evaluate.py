@@ -18,10 +18,11 @@ from crash_coach_bringup.cli.output import (
     table,
     write_json,
 )
-from policy_pkg.checkpoint import PolicyBundle, load_policy
+from crash_coach_bringup.cli.target import HELP, Target, load_target
 from policy_pkg.train.evaluate import (
     Condition,
     Evaluation,
+    Scripted,
     at_rate,
     crash_free,
     exactly,
@@ -77,17 +78,23 @@ def conditions(
 
 
 def evaluator(
-    checkpoint: Path, bundle: PolicyBundle, scenario: str, via: Via, layout: Layout
+    target: Target, via: Via, layout: Layout
 ) -> Callable[[Condition, int, int], Evaluation]:
-    """(condition, episodes, seed) -> Evaluation, in this process or as a ROS graph."""
+    """(condition, episodes, seed) -> Evaluation, in this process or as a ROS graph.
+
+    Raises:
+        CliError: a scripted team over ROS.
+    """
     if via is Via.core:
         return lambda condition, episodes, seed: evaluate_in_core(
-            bundle, scenario, condition, episodes, seed
+            target.team, target.scenario, condition, episodes, seed
         )
+    if isinstance(target.team, Scripted):
+        raise CliError(f"--via ros: {target.name} has no nodes; scripted teams play in the core")
     from crash_coach_bringup.ros.evaluation import evaluate_via_ros
 
     return lambda condition, episodes, seed: evaluate_via_ros(
-        checkpoint, scenario, condition, episodes, seed, layout.value
+        Path(target.name), target.scenario, condition, episodes, seed, layout.value
     )
 
 
@@ -106,27 +113,22 @@ def show(title: str, results: list[tuple[Condition, Evaluation]]) -> None:
 
 
 def as_json(results: list[tuple[Condition, Evaluation]]) -> list[dict[str, Any]]:
-    """Each condition's summary and episodes, without the positions."""
-    out = []
-    for condition, result in results:
-        episodes = [asdict(episode) for episode in result.episodes]
-        for episode in episodes:
-            episode.pop("positions_m", None)
-        out.append(
-            {
-                "name": condition.name,
-                "crash": condition.crash.model_dump(mode="json"),
-                **result.summary(),
-                "per_episode": episodes,
-            }
-        )
-    return out
+    """Each condition's summary and episodes."""
+    return [
+        {
+            "name": condition.name,
+            "crash": condition.crash.model_dump(mode="json"),
+            **result.summary(),
+            "per_episode": [asdict(episode) for episode in result.episodes],
+        }
+        for condition, result in results
+    ]
 
 
 def evaluate(
-    checkpoint: Annotated[Path, typer.Argument(help="Run directory or checkpoint directory.")],
+    team: Annotated[str, typer.Argument(metavar="TEAM", help=HELP)],
     scenario: Annotated[
-        str | None, typer.Option(help="Scenario name or YAML file; default: the checkpoint's.")
+        str | None, typer.Option(help="Scenario name or YAML file; default: the trained team's.")
     ] = None,
     episodes: Annotated[int, typer.Option(help="Episodes per condition.", min=1)] = 128,
     crash_rate: Annotated[
@@ -151,18 +153,18 @@ def evaluate(
     ] = 0,
     json: Annotated[Path | None, typer.Option(help="Also write the result to this file.")] = None,
 ) -> None:
-    """Evaluates a trained team greedily; without a crash option, crash-free."""
+    """Evaluates a team, a trained one greedily; without a crash option, crash-free."""
     check_json_target(json)
-    bundle = load_policy(checkpoint)
-    name = scenario or bundle.scenario
-    asked = conditions(bundle.robots, crash_rate or [], crashed or [], victims or [], mode)
-    run = evaluator(checkpoint, bundle, name, via, layout)
+    target = load_target(team, scenario)
+    name = target.scenario
+    asked = conditions(target.robots, crash_rate or [], crashed or [], victims or [], mode)
+    run = evaluator(target, via, layout)
     results = [(condition, run(condition, episodes, seed)) for condition in asked]
-    show(f"{checkpoint} on {name}: {episodes} episodes each, seed {seed}, via {via}", results)
+    show(f"{team} on {name}: {episodes} episodes each, seed {seed}, via {via}", results)
     summaries = as_json(results)
     trajectory_hash = combine(row["trajectory_hash"] for row in summaries)
     console.print(f"trajectory hash {trajectory_hash}", soft_wrap=True)
-    result: dict[str, Any] = {"checkpoint": str(checkpoint), "scenario": name, "via": via.value}
+    result: dict[str, Any] = {"team": team, "scenario": name, "via": via.value}
     result["layout"] = layout.value if via is Via.ros else None
     result |= {"seed": seed, "episodes": episodes, "mode": mode.value}
     write_json(json, {**result, "trajectory_hash": trajectory_hash, "conditions": summaries})

@@ -7,7 +7,7 @@ import sys
 
 import typer
 
-from crash_coach_bringup.cli import demo, doctor, evaluate, inject, plot, train, up
+from crash_coach_bringup.cli import demo, doctor, evaluate, inject, plot, render, train, up
 from sim_pkg.contract import UserError
 
 # Options that take several values, up to the next option: --crashed 0 1 2
@@ -28,6 +28,7 @@ app.command("up")(up.up)
 app.command("inject")(inject.inject)
 app.command("demo")(demo.demo)
 app.command("plot")(plot.plot)
+app.command("render")(render.render)
 
 
 def repeat_options(arguments: list[str]) -> list[str]:

@@ -2,41 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from policy_pkg.train.evaluate import Condition, Evaluation
-from sim_pkg.env import make_env
-from sim_pkg.render import Track, TrajectoryPanel, draw_trajectories
-
-Evaluations = list[tuple[Condition, Evaluation]]
+from policy_pkg.checkpoint import PolicyBundle
+from policy_pkg.train.evaluate import Condition, Evaluation, record_episode
+from sim_pkg.render import Panel, Track, draw_trajectories
 
 
-def draw_first_episodes(
-    teams: Mapping[str, tuple[str, Evaluations]], scenario: str, path: Path
-) -> None:
+@dataclass(frozen=True)
+class TeamResults:
+    """What a trained team did under each condition."""
+
+    label: str
+    colour: str
+    bundle: PolicyBundle
+    results: Sequence[tuple[Condition, Evaluation]]
+
+
+def draw_first_episodes(teams: Sequence[TeamResults], scenario: str, path: Path) -> None:
     """One panel per condition, with every team's trajectories in its colour.
 
-    teams: label -> (colour, evaluations); all teams under the same conditions, in one order,
-    evaluated with positions.
+    All teams have the same conditions, in one order. The episodes are played again to be drawn.
+
+    Raises:
+        RuntimeError: an episode that was played again is not the one that was evaluated.
     """
-    scene = make_env(scenario, 1).scene
-    names = [condition.name for condition, _ in next(iter(teams.values()))[1]]
     panels = []
-    for index, name in enumerate(names):
+    for index, (condition, _) in enumerate(teams[0].results):
         tracks = []
-        for label, (colour, evaluations) in teams.items():
-            episode = evaluations[index][1].episodes[0]
-            assert episode.positions_m is not None  # evaluated with positions
-            tracks.append(Track(label, colour, episode.positions_m, episode.crashed))
-        panels.append(
-            TrajectoryPanel(
-                name,
-                scene.arena_m,
-                scene.sites_m,
-                tracks,
-                grid=scene.cell_m > 0,
-                cell_m=scene.cell_m,
+        for team in teams:
+            condition, evaluation = team.results[index]
+            first = evaluation.episodes[0]
+            frames = record_episode(
+                team.bundle, scenario, condition, first.episode, evaluation.seed
             )
-        )
+            if frames.trajectory_hash != first.trajectory_hash:
+                raise RuntimeError(
+                    f"{team.label}, {condition.name}: episode {first.episode} has trajectory "
+                    f"hash {first.trajectory_hash}, played again {frames.trajectory_hash}"
+                )
+            tracks.append(Track(team.label, team.colour, frames))
+        panels.append(Panel(condition.name, tracks))
     draw_trajectories(panels, path)

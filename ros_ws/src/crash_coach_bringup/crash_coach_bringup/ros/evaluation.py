@@ -45,7 +45,6 @@ def evaluate_via_ros(
     episodes: int,
     seed: int,
     layout: Layout = "nodes",
-    record_positions: bool = False,
     log_dir: Path | None = None,
 ) -> Evaluation:
     """Plays episodes 0 .. ``episodes`` - 1 in lock-step on a ROS domain of its own.
@@ -84,7 +83,7 @@ def evaluate_via_ros(
                     raise EvaluationError(ended.describe())
 
             with graph_client("crash_coach_evaluation", domain, check) as client:
-                collector = Collector(client, coach, record_positions)
+                collector = Collector(client, coach)
                 results = tuple(collector.play(episode) for episode in range(episodes))
     return Evaluation(condition.name, robots, seed, results)
 
@@ -102,10 +101,9 @@ def _logs(log_dir: Path | None) -> Iterator[Path]:
 class Collector:
     """Starts episodes through /sim/reset and gathers what /sim/episode says about each."""
 
-    def __init__(self, client: GraphClient, coach: Coach, record_positions: bool) -> None:
+    def __init__(self, client: GraphClient, coach: Coach) -> None:
         self._client = client
         self._coach = coach
-        self._record_positions = record_positions
         self._states: dict[int, EpisodeState] = {}  # of the running episode, by step
         self._episode = -1
         self._last: EpisodeState | None = None
@@ -162,7 +160,6 @@ class Collector:
             steps=last.step,
             crashed=self._check_crashed(states),
             trajectory_hash=last.trajectory_hash,
-            positions_m=_positions(states) if self._record_positions else None,
         )
 
     def _check_crashed(self, states: list[EpisodeState]) -> tuple[int, ...]:
@@ -181,9 +178,3 @@ class Collector:
     def _names(self, mask: npt.NDArray[np.bool_]) -> str:
         robots = self._coach.robots
         return ", ".join(robots[i] for i in np.flatnonzero(mask)) or "nobody"
-
-
-def _positions(states: list[EpisodeState]) -> npt.NDArray[np.float32]:
-    """(T+1, n, 2)"""
-    rows = [np.frombuffer(state.positions_m, dtype=np.float32) for state in states]
-    return np.stack(rows).reshape(len(rows), -1, 2)
