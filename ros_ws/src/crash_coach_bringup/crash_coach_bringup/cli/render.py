@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from crash_coach_bringup.cli.evaluate import CrashMode, conditions
 from crash_coach_bringup.cli.output import CliError, check_json_target, console, write_json
 from crash_coach_bringup.cli.target import HELP, load_target
-from policy_pkg.train.evaluate import record_episode
+from policy_pkg.train.evaluate import Condition, record_episode
 from sim_pkg.frames import Frames
 
 FILMS, STILLS = (".mp4", ".gif"), (".png",)
@@ -49,6 +49,22 @@ def draw(frames: Frames, out: Path, speed: float) -> None:
         raise CliError(f"--out: {out} cannot be written: {error.strerror}") from None
 
 
+def report(frames: Frames, condition: Condition) -> dict[str, Any]:
+    """JSON values: which episode it is, and how it ended."""
+    return {
+        "scenario": frames.scenario,
+        "seed": frames.seed,
+        "episode": frames.episode,
+        "condition": condition.name,
+        "crash": condition.crash.model_dump(mode="json"),
+        "crashed": list(frames.faulted),
+        "success": frames.success,
+        "steps": frames.steps,
+        "episode_return": float(frames.returns[-1]),
+        "trajectory_hash": frames.trajectory_hash,
+    }
+
+
 def render(
     team: Annotated[str, typer.Argument(metavar="TEAM", help=HELP)],
     out: Annotated[Path, typer.Option(help="A .mp4 or .gif film, or a .png picture.")],
@@ -83,20 +99,4 @@ def render(
     done = "success" if frames.success else "no success"
     console.print(f"{done} after {frames.steps} steps; crashed: {who}", highlight=False)
     console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
-    write_json(
-        json,
-        {
-            "team": team,
-            "scenario": target.scenario,
-            "seed": seed,
-            "episode": episode,
-            "condition": asked[0].name,
-            "crash": asked[0].crash.model_dump(mode="json"),
-            "file": str(out),
-            "crashed": list(frames.faulted),
-            "success": frames.success,
-            "steps": frames.steps,
-            "episode_return": float(frames.returns[-1]),
-            "trajectory_hash": frames.trajectory_hash,
-        },
-    )
+    write_json(json, {"team": team, **report(frames, asked[0]), "file": str(out)})
