@@ -10,8 +10,8 @@ The files: skirmish_layout.py says where everything is in observations, state an
 skirmish_config.py what a map and a unit type may say; skirmish_tables.py holds both as arrays;
 skirmish_orders.py, skirmish_combat.py and skirmish_observe.py are compiled.
 
-The only chance is a random extra on the cooldown of every attack: the k-th attack of a unit draws
-the k-th number of a table that (seed, episode) alone determine.
+Chance is in the starts (``jitter_m``) and in a random extra on the cooldown of every attack: the
+k-th attack of a unit draws the k-th number of a table. Both depend on (seed, episode) alone.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ class Skirmish:
         self._inside = np.zeros((n_arenas, d), dtype=np.bool_)
         self._phase_s = config.dt_s / PHASES
         self._phase = 0
+        self._habits = (config.behaviour.help_m, config.behaviour.patience_s)
         theirs = tables.units[self._n :, MAX_HEALTH : MAX_SHIELD + 1]
         self._full_reward = (
             theirs.sum() + skirmish_observe.REWARD_KILL * len(theirs) + skirmish_observe.REWARD_WIN
@@ -71,9 +72,8 @@ class Skirmish:
 
     def begin(self, arena: int, seed: int, episode: int) -> Float64Array:
         """All whole and at their starts."""
-        self._fight.begin(self._tables, arena, self._n, episode_rng(seed, episode))
         self._inside[arena] = True
-        return self._tables.starts_m
+        return self._fight.begin(self._tables, arena, self._n, episode_rng(seed, episode))
 
     def observe(self, running: BoolArray, world: World, out: Buffers) -> None:
         tables, fight, layout = self._tables, self._fight, self.layout
@@ -94,7 +94,7 @@ class Skirmish:
         self._phase += 1
         skirmish_orders.drive(
             running, self._n, self._phase_s, world.bodies, tables.units, tables.reach_m,
-            tables.acquire_m, tables.leash_m, self.config.behaviour.help_m, tables.free_m,
+            tables.acquire_m, tables.leash_m, self._habits, tables.free_m,
             tables.goal_m, fight.real, fight.whole, world.commands,
         )  # fmt: skip
 

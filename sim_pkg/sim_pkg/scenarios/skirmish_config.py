@@ -68,6 +68,7 @@ class BehaviourConfig(StrictModel):
     acquire_m: Positive
     help_m: NotNegative
     leash_m: Positive
+    patience_s: NotNegative
 
 
 class PhysicsConfig(StrictModel):
@@ -88,6 +89,7 @@ class SkirmishConfig(StrictModel):
     free_m: tuple[NotNegative, NotNegative, Positive, Positive]
     robots: tuple[PlacedUnit, ...] = Field(min_length=1, max_length=64)
     opponents: tuple[PlacedUnit, ...] = Field(min_length=1, max_length=64)
+    jitter_m: NotNegative
     behaviour: BehaviourConfig
     physics: PhysicsConfig
     unit_types: dict[str, UnitConfig] = Field(default_factory=dict)
@@ -158,25 +160,28 @@ class SkirmishConfig(StrictModel):
 
     def _check_starts(self) -> None:
         west, south, east, north = self.free_m
+        jitter = self.jitter_m
         units, before = self.units, list[tuple[str, PlacedUnit, float]]()
         for ((team, index), placed), unit in zip(self._places(), units, strict=True):
             (x, y), radius = placed.start_m, unit.body_radius_m
+            spare = radius + jitter
             name = f"{team}.{index}.start_m = [{x:g}, {y:g}]"
-            inside_x = west + radius <= x <= east - radius
-            if not (inside_x and south + radius <= y <= north - radius):
+            inside_x = west + spare <= x <= east - spare
+            if not (inside_x and south + spare <= y <= north - spare):
                 raise Misplaced(
                     (team, index, "start_m"),
                     f"{name}: outside the walls, where the other team cannot reach it; x must be "
-                    f"in {west + radius:g}..{east - radius:g}, "
-                    f"y in {south + radius:g}..{north - radius:g}",
+                    f"in {west + spare:g}..{east - spare:g}, "
+                    f"y in {south + spare:g}..{north - spare:g} (with radius and jitter_m)",
                 )
             for other_name, other, other_radius in before:
                 gap = math.dist(placed.start_m, other.start_m)
-                if gap < radius + other_radius:
+                needed = radius + other_radius + 2 * math.sqrt(2) * jitter
+                if gap < needed:
                     raise Misplaced(
                         (team, index, "start_m"),
-                        f"{name}: overlaps {other_name}, {gap:g} m away; at least "
-                        f"{radius + other_radius:g} is needed",
+                        f"{name}: can overlap {other_name}, {gap:g} m away; at least "
+                        f"{needed:g} is needed (with radii and jitter_m)",
                     )
             before.append((f"{team}.{index}", placed, radius))
 

@@ -19,6 +19,7 @@ from sim_pkg.scenarios.skirmish_tables import (
     ALIVE,
     ATTACK,
     BODY_RADIUS_M,
+    CHASE,
     GO,
     HALT,
     HITTER,
@@ -78,14 +79,20 @@ def take_orders(running, actions, bodies, real, whole):  # type: ignore[no-untyp
 
 @njit(cache=True)
 def drive(  # type: ignore[no-untyped-def]
-    running, n, phase_s, bodies, units, reach, acquire, leash, help_m, free, goal, real, whole,
+    running, n, phase_s, bodies, units, reach, acquire, leash, habits, free, goal, real, whole,
     commands,
 ):  # fmt: skip
     """The opponents choose their targets; then everyone's velocity for the next phase."""
     for b in range(bodies.shape[0]):
         if not running[b]:
             continue
-        _choose_targets(n, bodies[b], acquire, leash, help_m, goal, real[b], whole[b])
+        for j in range(n, whole.shape[1]):
+            if whole[b, j, ALIVE]:
+                _choose_target(
+                    n, j, phase_s, bodies[b], reach, acquire, leash, habits, goal, real[b], whole[b]
+                )
+        for j in range(n, whole.shape[1]):
+            whole[b, j, HITTER] = -1
         for i in range(units.shape[0]):
             real[b, i, OLD_X] = bodies[b, i, 0]
             real[b, i, OLD_Y] = bodies[b, i, 1]
@@ -96,28 +103,29 @@ def drive(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _choose_targets(n, bodies, acquire, leash, help_m, goal, real, whole):  # type: ignore[no-untyped-def]
-    """Attack-move: each opponent keeps its target while it can, else looks for one."""
-    d = whole.shape[0]
-    for j in range(n, d):
-        if not whole[j, ALIVE]:
-            continue
-        target = whole[j, TARGET]
-        if target >= 0 and (
-            not whole[target, ALIVE] or _distance(bodies, j, target) > leash[j, target]
-        ):
+def _choose_target(  # type: ignore[no-untyped-def]
+    n, j, phase_s, bodies, reach, acquire, leash, habits, goal, real, whole
+):
+    """Attack-move: opponent j keeps its target while it can, else looks for one."""
+    help_m, patience_s = habits
+    target = whole[j, TARGET]
+    if target >= 0:
+        distance = _distance(bodies, j, target)
+        real[j, CHASE] = 0.0 if distance <= reach[j, target] else real[j, CHASE] + phase_s
+        if distance > leash[j, target]:
             target = -1
-        if target < 0:
-            target = _look_around(n, j, bodies, acquire, help_m, whole)
-        whole[j, TARGET] = target
-        if target >= 0:
-            whole[j, ORDER] = ATTACK
-        else:
-            whole[j, ORDER] = GO
-            real[j, POINT_X] = goal[0]
-            real[j, POINT_Y] = goal[1]
-    for j in range(n, d):
-        whole[j, HITTER] = -1
+    if target < 0 or real[j, CHASE] > patience_s:
+        found = _look_around(n, j, bodies, acquire, help_m, whole)
+        if found >= 0:
+            target = found
+        real[j, CHASE] = 0.0
+    whole[j, TARGET] = target
+    if target >= 0:
+        whole[j, ORDER] = ATTACK
+    else:
+        whole[j, ORDER] = GO
+        real[j, POINT_X] = goal[0]
+        real[j, POINT_Y] = goal[1]
 
 
 @njit(cache=True)

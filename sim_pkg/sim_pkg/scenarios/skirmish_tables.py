@@ -23,8 +23,10 @@ from sim_pkg.world import Float64Array
 # Of a unit, changing: (B, d, REAL_COLUMNS) float64.
 # WAIT: seconds until the next attack may start. SINCE: seconds since the present attack started.
 # QUIET: seconds since the last damage. OLD: where it was when the phase began. POINT: where it
-# was ordered to go.
-HEALTH, SHIELD, WAIT, SINCE, QUIET, OLD_X, OLD_Y, POINT_X, POINT_Y, REAL_COLUMNS = range(10)
+# was ordered to go. CHASE: seconds for which an opponent's target has been out of its reach.
+(
+    HEALTH, SHIELD, WAIT, SINCE, QUIET, OLD_X, OLD_Y, POINT_X, POINT_Y, CHASE, REAL_COLUMNS,
+) = range(11)  # fmt: skip
 
 # Of a unit, changing: (B, d, WHOLE_COLUMNS) int32; discs by number, -1: none.
 # TARGET: whom to attack. VICTIM: whom the present attack hits. NEXT_HIT: of the present attack.
@@ -55,6 +57,7 @@ class Tables:
     free_m: Float64Array  # (4,) x1, y1, x2, y2
     goal_m: Float64Array  # (2,) where the opponents go
     type_bits: FloatArray  # (d, number of type names)
+    jitter_m: float  # of the starts, in x and y
     n_attacks: int  # more than a unit can start in an episode
 
     @classmethod
@@ -83,6 +86,7 @@ class Tables:
             free_m=np.array(config.free_m),
             goal_m=starts_m[: len(config.robots)].mean(axis=0),
             type_bits=np.array([layout.type_bits(p.unit) for p in config.placed]),
+            jitter_m=config.jitter_m,
             n_attacks=int(seconds / shortest_s) + 2,
         )
 
@@ -122,13 +126,17 @@ class Fight:
             standing=np.zeros((b, 2)),
         )
 
-    def begin(self, tables: Tables, arena: int, n_robots: int, rng: np.random.Generator) -> None:
-        """All whole and at their starts, nobody ordered."""
+    def begin(
+        self, tables: Tables, arena: int, n_robots: int, rng: np.random.Generator
+    ) -> Float64Array:
+        """All whole and at their starts, nobody ordered. (d, 2) where they start."""
         units, real, whole = tables.units, self.real[arena], self.whole[arena]
+        shift_m = rng.uniform(-tables.jitter_m, tables.jitter_m, tables.starts_m.shape)
+        starts_m: Float64Array = tables.starts_m + shift_m
         real[:] = 0.0
         real[:, HEALTH] = units[:, MAX_HEALTH]
         real[:, SHIELD] = units[:, MAX_SHIELD]
-        real[:, OLD_X : OLD_Y + 1] = tables.starts_m
+        real[:, OLD_X : OLD_Y + 1] = starts_m
         whole[:] = -1
         whole[:, ALIVE] = 1
         whole[:, ORDER] = HALT
@@ -139,3 +147,4 @@ class Fight:
         self.steps[arena] = 0
         theirs = units[n_robots:]
         self.standing[arena] = theirs[:, MAX_HEALTH : MAX_SHIELD + 1].sum(), len(theirs)
+        return starts_m
