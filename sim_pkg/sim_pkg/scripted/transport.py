@@ -21,7 +21,7 @@ from sim_pkg.scripted.base import Entry
 from sim_pkg.scripted.driving import drive_to, read_others
 
 # A robot that stays within _STILL_M for this many steps stands still.
-_STILL_STEPS = 5
+_STILL_STEPS = 4
 _LEFT_OUT = 1000000
 _STILL_M = 0.1
 # Free room: between robots in line, behind the box before the push, beside the rough floor.
@@ -41,8 +41,9 @@ _ARC_RAD = 0.8
 class TransportPolicy:
     """Both policies over ``n_arenas`` arenas.
 
-    Memory of robot i: where it last saw each robot j move to and how many steps ago; which face
-    it pushes; whether it chose to go around, and whether the way to the goal was free since.
+    Memory of robot i: where it last saw each robot j move to, where the box was then, and how
+    many steps ago that was; which face it pushes; whether it chose to go around, and whether the
+    way to the goal was free since.
     """
 
     def __init__(
@@ -51,7 +52,7 @@ class TransportPolicy:
         n, box, robot = spec.n_robots, config.box, config.robot
         self._config = config
         self._goes_around = goes_around
-        self._last_m = np.zeros((n_arenas, n, n, 2))
+        self._last_m = np.zeros((n_arenas, n, n, 4))
         self._still = np.zeros((n_arenas, n, n), dtype=np.int32)
         self._around = np.zeros((n_arenas, n), dtype=np.bool_)
         self._past = np.zeros((n_arenas, n), dtype=np.bool_)
@@ -127,15 +128,20 @@ def _crosses(start, end, rough, berth_m):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _count_still(place, box, last_m, still, reach_m):  # type: ignore[no-untyped-def]
-    """For how many steps a robot that is seen at ``place`` has not moved; updates ``last_m``.
+    """For how many steps a robot that is seen at ``place`` has not moved.
 
-    _LEFT_OUT once that is too long: sooner away from the box than at it, where robots wait.
+    _LEFT_OUT once that is too long: at the box, where robots wait, longer than elsewhere, unless
+    the box moved meanwhile. ``last_m``: place of the robot, then of the box, when it last moved.
     """
     if (place[0] - last_m[0]) ** 2 + (place[1] - last_m[1]) ** 2 > _STILL_M**2:
-        last_m[:] = place
+        last_m[:2] = place
+        last_m[2:] = box
         return 0
     gap = np.sqrt((place[0] - box[0]) ** 2 + (place[1] - box[1]) ** 2)
-    patience = _STILL_STEPS if gap > 1.5 * reach_m else 3 * _STILL_STEPS
+    pushed = np.sqrt((box[0] - last_m[2]) ** 2 + (box[1] - last_m[3]) ** 2)
+    patience = 3 * _STILL_STEPS
+    if gap > 1.5 * reach_m or pushed > 4.0 * _STILL_M:
+        patience = _STILL_STEPS
     return still + 1 if still + 1 < patience else _LEFT_OUT
 
 
