@@ -9,9 +9,8 @@ Actions: stay (brake) or full speed in one of 8 directions.
 
 Observation of a robot, (4 + 4 m + 3 (n - 1),), all in [-1, 1]:
     own x, y from the arena's centre over half its size, own vx, vy over the top speed |
-    per site: dx over the arena's width, dy over its height, seen (0 or 1), the share of the
-    watching that is left (0 where unseen: how far a site is can only be seen within
-    ``sight_m``; where the sites are is known) |
+    per site: dx over the arena's width, dy over its height (where the sites are is known), seen
+    (0 or 1: within ``sight_m``), the share of its watching that is left (0 where unseen) |
     per other robot: seen (0 or 1), dx, dy over ``sight_m`` (zeros where unseen).
 State, (4 n + 3 m + 1,): per robot x, y, vx, vy as above | per site x, y, share left | share of
 the episode limit that has passed.
@@ -28,7 +27,7 @@ import numpy as np
 from numba import njit
 from pydantic import Field, model_validator
 
-from sim_pkg.config import StrictModel
+from sim_pkg.config import Misplaced, StrictModel
 from sim_pkg.contract import BoolArray, EnvSpec, IntArray
 from sim_pkg.scenarios import drive
 from sim_pkg.scenarios.base import Buffers, Kind, Scene, episode_rng, robot_names
@@ -62,13 +61,15 @@ class CoverageConfig(StrictModel):
     def _check(self) -> CoverageConfig:
         radius_m = self.robot.radius_m
         drive.check_starts(self.starts, self.arena_m, self.start_jitter_m, radius_m)
-        drive.check_inside("sites", self.sites, self.arena_m, radius_m)
-        if len(set(self.sites)) < len(self.sites):
-            raise ValueError("sites: two sites at the same place")
+        for j, site in enumerate(self.sites):
+            drive.check_inside(("sites", j), site, self.arena_m, radius_m)
+            if site in self.sites[:j]:
+                raise Misplaced(("sites", j), f"sites: {list(site)} again; one site per place")
         if self.sight_m <= self.watch_radius_m:
-            raise ValueError(
+            raise Misplaced(
+                ("sight_m",),
                 f"sight_m: {self.sight_m} must exceed watch_radius_m, {self.watch_radius_m}: a "
-                f"robot sees the site that it watches"
+                f"robot sees the site that it watches",
             )
         return self
 

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from pydantic import Field
 
-from sim_pkg.config import StrictModel
+from sim_pkg.config import Misplaced, StrictModel
 from sim_pkg.world import DiscSpec, box_walls
 
 ACTIONS = (
@@ -58,33 +58,35 @@ def check_starts(
     """Refuses robots that could start in a wall or in each other.
 
     Raises:
-        ValueError: naming the start and what is right.
+        Misplaced: naming the start and what is right.
     """
-    check_inside("starts", starts, arena_m, radius_m + jitter_m)
-    apart_m = 2 * (radius_m + np.sqrt(2.0) * jitter_m)
+    apart_m = 2 * (radius_m + float(np.sqrt(2.0)) * jitter_m)
     for i, first in enumerate(starts):
+        check_inside(("starts", i), first, arena_m, radius_m + jitter_m)
         for second in starts[:i]:
             if np.hypot(first[0] - second[0], first[1] - second[1]) < apart_m:
-                raise ValueError(
-                    f"starts: {list(second)} and {list(first)} may overlap; with this radius and "
-                    f"start_jitter_m, starts must be at least {apart_m:.3g} m apart"
+                raise Misplaced(
+                    ("starts", i),
+                    f"starts: {list(second)} and {list(first)} may overlap; with this radius_m and "
+                    f"start_jitter_m, starts must be at least {apart_m:.3g} m apart",
                 )
 
 
-def check_inside(key: str, points: tuple[Point, ...], arena_m: Point, margin_m: float) -> None:
-    """Refuses points that are nearer to a wall than ``margin_m``.
+def check_inside(
+    location: tuple[int | str, ...], point: Point, arena_m: Point, margin_m: float
+) -> None:
+    """Refuses a point that is nearer to a wall than ``margin_m``.
 
     Raises:
-        ValueError: naming the point and what is right.
+        Misplaced: naming the point and what is right.
     """
-    for point in points:
-        if any(
-            not margin_m <= x <= size - margin_m for x, size in zip(point, arena_m, strict=True)
-        ):
-            raise ValueError(
-                f"{key}: {list(point)} is too near to a wall; at least {margin_m:g} m from the "
-                f"edges of the {arena_m[0]:g} x {arena_m[1]:g} m arena"
-            )
+    if any(not margin_m <= x <= size - margin_m for x, size in zip(point, arena_m, strict=True)):
+        name = ".".join(str(part) for part in location)
+        raise Misplaced(
+            location,
+            f"{name}: {list(point)} is too near to a wall; at least {margin_m:g} m from the "
+            f"edges of the {arena_m[0]:g} x {arena_m[1]:g} m arena",
+        )
 
 
 @njit(cache=True)

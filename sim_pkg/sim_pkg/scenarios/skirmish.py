@@ -8,7 +8,7 @@ step was too coarse: at 0.5 s a zealot that follows a stalker aims 1.5 m behind 
 
 The files: skirmish_layout.py says where everything is in observations, state and actions;
 skirmish_config.py what a map and a unit type may say; skirmish_tables.py holds both as arrays;
-skirmish_orders.py, skirmish_combat.py and skirmish_observe.py are compiled.
+skirmish_orders.py, skirmish_brake.py, skirmish_combat.py and skirmish_observe.py are compiled.
 
 Chance is in the starts (``jitter_m``) and in a random extra on the cooldown of every attack: the
 k-th attack of a unit draws the k-th number of a table. Both depend on (seed, episode) alone.
@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 
 from sim_pkg.contract import BoolArray, EnvSpec, IntArray
-from sim_pkg.scenarios import skirmish_combat, skirmish_observe, skirmish_orders
+from sim_pkg.scenarios import skirmish_brake, skirmish_combat, skirmish_observe, skirmish_orders
 from sim_pkg.scenarios.base import Buffers, Kind, Scene, episode_rng, robot_names
 from sim_pkg.scenarios.skirmish_config import PHASES, TICK_S, SkirmishConfig
 from sim_pkg.scenarios.skirmish_layout import NO_OP, STOP
@@ -94,8 +94,12 @@ class Skirmish:
         self._phase += 1
         skirmish_orders.drive(
             running, self._n, self._phase_s, world.bodies, tables.units, tables.reach_m,
-            tables.acquire_m, tables.leash_m, self._habits, tables.free_m,
-            tables.goal_m, fight.real, fight.whole, world.commands,
+            tables.acquire_m, tables.leash_m, self._habits, tables.goal_m, fight.real, fight.whole,
+            world.commands,
+        )  # fmt: skip
+        skirmish_brake.brake(
+            running, self._phase_s, world.bodies, tables.units, tables.free_m, fight.whole,
+            world.commands,
         )  # fmt: skip
 
     def settle(self, running: BoolArray, world: World, out: Buffers) -> None:

@@ -1,10 +1,8 @@
-"""Compiled: what every unit is told and how fast it goes, once per phase of a control step.
+"""Compiled: what every unit is told and how fast it wants to go, once per phase.
 
 Before the physics of a phase each unit gets a velocity: to the point it was ordered to, or
 towards its target until that is within reach. Whoever has something in the way goes around it, on
-one side until the way is free. Then everyone brakes: Chipmunk notices two discs only when they
-overlap already, up to a substep's way deep, so as in engines with speculative contacts (Bullet,
-Box2D) no pair may come closer in a phase than touching. Nobody is pushed away by that.
+one side until the way is free. skirmish_brake.py then keeps them from running into each other.
 
 Shapes and columns as in skirmish_tables.py.
 """
@@ -43,7 +41,6 @@ SLACK_M = 0.02  # a chaser aims this far inside its reach
 WATCH_M = 0.35  # what is nearer than this, edge to edge, can be in the way
 AHEAD = 0.5  # cosine of the angle within which it is
 SAME_PACE = 0.8  # what goes the same way at this share of one's speed is not in the way
-BRAKE_PASSES = 3
 
 
 @njit(cache=True)
@@ -79,7 +76,7 @@ def take_orders(running, actions, bodies, real, whole):  # type: ignore[no-untyp
 
 @njit(cache=True)
 def drive(  # type: ignore[no-untyped-def]
-    running, n, phase_s, bodies, units, reach, acquire, leash, habits, free, goal, real, whole,
+    running, n, phase_s, bodies, units, reach, acquire, leash, habits, goal, real, whole,
     commands,
 ):  # fmt: skip
     """The opponents choose their targets; then everyone's velocity for the next phase."""
@@ -99,7 +96,6 @@ def drive(  # type: ignore[no-untyped-def]
             vx, vy = _wish(i, phase_s, bodies[b], units, reach, real[b], whole[b])
             commands[b, i, 0] = vx
             commands[b, i, 1] = vy
-        _brake(phase_s, bodies[b], units, free, whole[b], commands[b])
 
 
 @njit(cache=True)
@@ -216,69 +212,6 @@ def _around(i, target, dx, dy, speed, bodies, units, whole):  # type: ignore[no-
             whole[i, SIDE] = 1 if i % 2 == 0 else -1
     side = whole[i, SIDE]
     return -side * y, side * x
-
-
-@njit(cache=True)
-def _brake(phase_s, bodies, units, free, whole, commands):  # type: ignore[no-untyped-def]
-    """Slows approaching pairs so that, if they keep their velocities, they just touch."""
-    d = units.shape[0]
-    for _ in range(BRAKE_PASSES):
-        changed = False
-        _brake_at_walls(phase_s, bodies, units, free, commands)
-        for i in range(d):
-            if not whole[i, ALIVE]:
-                continue
-            for k in range(i + 1, d):
-                if whole[k, ALIVE] and _brake_pair(i, k, phase_s, bodies, units, commands):
-                    changed = True
-        if not changed:
-            return
-    _brake_at_walls(phase_s, bodies, units, free, commands)
-
-
-@njit(cache=True)
-def _brake_pair(i, k, phase_s, bodies, units, commands):  # type: ignore[no-untyped-def]
-    """Whether i and k had to brake: along the line between them, in proportion to what each
-    contributes to the approach."""
-    x, y = bodies[k, 0] - bodies[i, 0], bodies[k, 1] - bodies[i, 1]
-    touch = units[i, BODY_RADIUS_M] + units[k, BODY_RADIUS_M]
-    far = touch + (units[i, SPEED_MPS] + units[k, SPEED_MPS]) * phase_s
-    square = x * x + y * y
-    if square > far * far or square < 1e-12:
-        return False
-    vx, vy = commands[k, 0] - commands[i, 0], commands[k, 1] - commands[i, 1]
-    closing = -(vx * x + vy * y)
-    if closing <= 1e-12:
-        return False
-    distance = np.sqrt(square)
-    if distance > touch:
-        when = min(phase_s, closing / (vx * vx + vy * vy))
-        nx, ny = x + when * vx, y + when * vy
-        if nx * nx + ny * ny >= touch * touch:
-            return False
-    x /= distance
-    y /= distance
-    mine = commands[i, 0] * x + commands[i, 1] * y
-    theirs = -(commands[k, 0] * x + commands[k, 1] * y)
-    spare = max(distance - touch, 0.0) / phase_s - (mine + theirs)
-    if spare >= -1e-9:
-        return False
-    total = max(mine, 0.0) + max(theirs, 0.0)
-    for who, part, sign in ((i, max(mine, 0.0), 1.0), (k, max(theirs, 0.0), -1.0)):
-        slower = sign * spare * part / total
-        commands[who, 0] += slower * x
-        commands[who, 1] += slower * y
-    return True
-
-
-@njit(cache=True)
-def _brake_at_walls(phase_s, bodies, units, free, commands):  # type: ignore[no-untyped-def]
-    for i in range(units.shape[0]):
-        radius = units[i, BODY_RADIUS_M]
-        for axis in range(2):
-            low = min(free[axis] + radius - bodies[i, axis], 0.0) / phase_s
-            high = max(free[axis + 2] - radius - bodies[i, axis], 0.0) / phase_s
-            commands[i, axis] = min(max(commands[i, axis], low), high)
 
 
 @njit(cache=True)

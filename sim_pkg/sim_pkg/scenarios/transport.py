@@ -34,7 +34,7 @@ import numpy as np
 from numba import njit
 from pydantic import Field, model_validator
 
-from sim_pkg.config import StrictModel
+from sim_pkg.config import Misplaced, StrictModel
 from sim_pkg.contract import BoolArray, EnvSpec, IntArray
 from sim_pkg.scenarios import drive
 from sim_pkg.scenarios.base import Buffers, Kind, Scene, episode_rng, robot_names
@@ -68,11 +68,12 @@ class FloorConfig(StrictModel):
 
     @model_validator(mode="after")
     def _check(self) -> FloorConfig:
-        for x1, y1, x2, y2 in self.rough:
+        for i, (x1, y1, x2, y2) in enumerate(self.rough):
             if x1 >= x2 or y1 >= y2:
-                raise ValueError(
+                raise Misplaced(
+                    ("rough", i),
                     f"rough: {[x1, y1, x2, y2]} is empty; expected [x1, y1, x2, y2] with "
-                    f"x1 < x2 and y1 < y2"
+                    f"x1 < x2 and y1 < y2",
                 )
         return self
 
@@ -102,19 +103,20 @@ class TransportConfig(StrictModel):
         box, radius_m, jitter_m = self.box, self.robot.radius_m, self.start_jitter_m
         drive.check_starts(self.starts, self.arena_m, jitter_m, radius_m)
         half_m = max(box.width_m, box.height_m) / 2
-        drive.check_inside("box.start", (box.start,), self.arena_m, half_m + jitter_m)
-        drive.check_inside("goal", (self.goal,), self.arena_m, half_m)
+        drive.check_inside(("box", "start"), box.start, self.arena_m, half_m + jitter_m)
+        drive.check_inside(("goal",), self.goal, self.arena_m, half_m)
         reach = (box.width_m / 2 + radius_m, box.height_m / 2 + radius_m)
-        for start in self.starts:
+        for i, start in enumerate(self.starts):
             gaps = [abs(a - b) - 2 * jitter_m for a, b in zip(start, box.start, strict=True)]
             if gaps[0] < reach[0] and gaps[1] < reach[1]:
-                raise ValueError(
+                raise Misplaced(
+                    ("starts", i),
                     f"starts: {list(start)} may overlap the box at {list(box.start)}; with "
                     f"start_jitter_m {jitter_m:g} it must be {reach[0] + 2 * jitter_m:.3g} m "
-                    f"away along x or {reach[1] + 2 * jitter_m:.3g} m along y"
+                    f"away along x or {reach[1] + 2 * jitter_m:.3g} m along y",
                 )
         if np.hypot(*np.subtract(self.goal, box.start)) < self.goal_radius_m + 2 * jitter_m:
-            raise ValueError(f"goal: {list(self.goal)} is where the box starts")
+            raise Misplaced(("goal",), f"goal: {list(self.goal)} is where the box starts")
         return self
 
 
