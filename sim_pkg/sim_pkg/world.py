@@ -181,7 +181,8 @@ class _Builder:
         body = self._add_body(lib.cpBodyNew(disc.mass_kg, np.inf))
         lib.cpBodySetPosition(body, position_m)
         shape = lib.cpCircleShapeNew(body, disc.radius_m, (0.0, 0.0))
-        lib.cpShapeSetFilter(shape, (disc.group, _ALL_CATEGORIES, _ALL_CATEGORIES))
+        if disc.group:
+            lib.cpShapeSetFilter(shape, (disc.group, _ALL_CATEGORIES, _ALL_CATEGORIES))
         self._add_shape(shape, disc.friction)
         return body, shape
 
@@ -221,7 +222,8 @@ class _Builder:
 
     def _add_shape(self, shape: Any, friction: float) -> None:
         self._shapes.append(shape)
-        lib.cpShapeSetFriction(shape, friction)
+        if friction:
+            lib.cpShapeSetFriction(shape, friction)
         lib.cpSpaceAddShape(self._space, shape)
 
     def _add_joint(self, joint: Any) -> Any:

@@ -70,91 +70,100 @@ def observe(  # type: ignore[no-untyped-def]
     running, n, shields, bodies, units, types, free, arena_m, real, whole, obs, state, available
 ):
     """``shields``: whether features for the robots', the opponents' shields exist."""
+    d = units.shape[0]
+    now = np.empty((d, 4))  # x, y, health, shield as a share of the full one
     for b in range(bodies.shape[0]):
         if not running[b]:
             continue
-        _state(n, shields, bodies[b], units, types, arena_m, real[b], whole[b], state[b])
+        for i in range(d):
+            now[i, 0] = bodies[b, i, 0]
+            now[i, 1] = bodies[b, i, 1]
+            now[i, 2] = real[b, i, HEALTH] / units[i, MAX_HEALTH]
+            most = units[i, MAX_SHIELD]
+            now[i, 3] = real[b, i, SHIELD] / most if most > 0.0 else 0.0
+        _state(b, n, shields, now, units, types, arena_m, real, whole, state)
         for i in range(n):
-            obs[b, i, :] = 0.0
-            available[b, i, :] = False
-            if not whole[b, i, ALIVE]:
+            for k in range(obs.shape[2]):
+                obs[b, i, k] = 0.0
+            for k in range(available.shape[2]):
+                available[b, i, k] = False
+            if whole[b, i, ALIVE]:
+                _free_ways(b, i, now, units, free, obs, available)
+                _look(b, i, n, shields, now, types, whole, obs, available)
+            else:
                 available[b, i, NO_OP] = True
-                continue
-            _free_ways(i, bodies[b], units, free, obs[b, i], available[b, i])
-            _look(i, n, shields, bodies[b], units, types, real[b], whole[b], obs[b, i],
-                  available[b, i])  # fmt: skip
 
 
 @njit(cache=True)
-def _free_ways(i, bodies, units, free, obs, available):  # type: ignore[no-untyped-def]
+def _free_ways(b, i, now, units, free, obs, available):  # type: ignore[no-untyped-def]
     """A move is available if half its way is free of walls, as in SMAC."""
-    available[STOP] = True
+    available[b, i, STOP] = True
     radius = units[i, BODY_RADIUS_M] - ROUNDING_M
     for k in range(4):
-        x = bodies[i, 0] + WAYS[k, 0] * MOVE_M / 2
-        y = bodies[i, 1] + WAYS[k, 1] * MOVE_M / 2
-        # A disc that dents a wall may still go along it.
-        in_x = k < 2 or free[0] + radius <= x <= free[2] - radius
-        in_y = k >= 2 or free[1] + radius <= y <= free[3] - radius
-        if in_x and in_y:
-            available[NORTH + k] = True
-            obs[k] = 1.0
+        # A disc that touches a wall may still go along it.
+        axis = 1 if k < 2 else 0
+        place = now[i, axis] + WAYS[k, axis] * MOVE_M / 2
+        if free[axis] + radius <= place <= free[axis + 2] - radius:
+            available[b, i, NORTH + k] = True
+            obs[b, i, k] = 1.0
 
 
 @njit(cache=True)
-def _look(i, n, shields, bodies, units, types, real, whole, obs, available):  # type: ignore[no-untyped-def]
+def _look(b, i, n, shields, now, types, whole, obs, available):  # type: ignore[no-untyped-def]
     """Opponents, allies and oneself, from column 4 on; and which attacks are available."""
     at = 4
-    for k in range(n, whole.shape[0] + n):
+    d = whole.shape[1]
+    for k in range(n, d + n):
         # Opponents first, then the robots.
-        j = k if k < whole.shape[0] else k - whole.shape[0]
+        j = k if k < d else k - d
         if j == i:
             continue
         shield = shields[0] if j < n else shields[1]
-        if whole[j, ALIVE]:
-            x, y = bodies[j, 0] - bodies[i, 0], bodies[j, 1] - bodies[i, 1]
-            distance = np.sqrt(x * x + y * y)
-            if distance <= SIGHT_M:
-                if j < n:
-                    obs[at] = 1.0
-                elif distance <= ATTACK_M:
-                    obs[at] = 1.0
-                    available[FIRST_ATTACK + j - n] = True
-                obs[at + 1] = distance / SIGHT_M
-                obs[at + 2] = x / SIGHT_M
-                obs[at + 3] = y / SIGHT_M
-                _body(j, shield, units, types, real, obs, at + 4, at + 4 + 1)
+        x, y = now[j, 0] - now[i, 0], now[j, 1] - now[i, 1]
+        square = x * x + y * y
+        if square <= SIGHT_M * SIGHT_M and whole[b, j, ALIVE]:
+            distance = np.sqrt(square)
+            if j < n:
+                obs[b, i, at] = 1.0
+            elif distance <= ATTACK_M:
+                obs[b, i, at] = 1.0
+                available[b, i, FIRST_ATTACK + j - n] = True
+            obs[b, i, at + 1] = distance * (1.0 / SIGHT_M)
+            obs[b, i, at + 2] = x * (1.0 / SIGHT_M)
+            obs[b, i, at + 3] = y * (1.0 / SIGHT_M)
+            obs[b, i, at + 4] = now[j, 2]
+            if shield:
+                obs[b, i, at + 5] = now[j, 3]
+            for t in range(types.shape[1]):
+                obs[b, i, at + 5 + shield + t] = types[j, t]
         at += 5 + shield + types.shape[1]
-    _body(i, shields[0], units, types, real, obs, at, at + 1)
+    obs[b, i, at] = now[i, 2]
+    if shields[0]:
+        obs[b, i, at + 1] = now[i, 3]
+    for t in range(types.shape[1]):
+        obs[b, i, at + 1 + shields[0] + t] = types[i, t]
 
 
 @njit(cache=True)
-def _body(j, shield, units, types, real, out, at, more_at):  # type: ignore[no-untyped-def]
-    """Health at ``at``; shield, where the layout has one, and type bits from ``more_at`` on."""
-    out[at] = real[j, HEALTH] / units[j, MAX_HEALTH]
-    if shield:
-        if units[j, MAX_SHIELD] > 0.0:
-            out[more_at] = real[j, SHIELD] / units[j, MAX_SHIELD]
-        more_at += 1
-    for k in range(types.shape[1]):
-        out[more_at + k] = types[j, k]
-
-
-@njit(cache=True)
-def _state(n, shields, bodies, units, types, arena_m, real, whole, state):  # type: ignore[no-untyped-def]
-    state[:] = 0.0
+def _state(b, n, shields, now, units, types, arena_m, real, whole, state):  # type: ignore[no-untyped-def]
+    for k in range(state.shape[1]):
+        state[b, k] = 0.0
     at = 0
-    for j in range(whole.shape[0]):
+    for j in range(whole.shape[1]):
         shield = shields[0] if j < n else shields[1]
         place = at + 2 if j < n else at + 1
-        if whole[j, ALIVE]:
+        if whole[b, j, ALIVE]:
+            state[b, at] = now[j, 2]
             if j < n:
-                state[at + 1] = real[j, WAIT] / (units[j, COOLDOWN_S] + EXTRA_S[1])
-            state[place] = (bodies[j, 0] - arena_m[0] / 2) / arena_m[0]
-            state[place + 1] = (bodies[j, 1] - arena_m[1] / 2) / arena_m[1]
-            _body(j, shield, units, types, real, state, at, place + 2)
+                state[b, at + 1] = real[b, j, WAIT] / (units[j, COOLDOWN_S] + EXTRA_S[1])
+            for axis in range(2):
+                state[b, place + axis] = now[j, axis] / arena_m[axis] - 0.5
+            if shield:
+                state[b, place + 2] = now[j, 3]
+            for t in range(types.shape[1]):
+                state[b, place + 2 + shield + t] = types[j, t]
         at = place + 2 + shield + types.shape[1]
-    actions = (state.shape[0] - at) // n
+    actions = (state.shape[1] - at) // n
     for i in range(n):
-        if whole[i, LAST_ACTION] >= 0:
-            state[at + i * actions + whole[i, LAST_ACTION]] = 1.0
+        if whole[b, i, LAST_ACTION] >= 0:
+            state[b, at + i * actions + whole[b, i, LAST_ACTION]] = 1.0

@@ -76,87 +76,95 @@ def take_orders(running, actions, bodies, real, whole):  # type: ignore[no-untyp
 
 @njit(cache=True)
 def drive(  # type: ignore[no-untyped-def]
-    running, n, phase_s, bodies, units, reach, acquire, leash, habits, goal, real, whole,
-    commands,
-):  # fmt: skip
-    """The opponents choose their targets; then everyone's velocity for the next phase."""
+    running, n, phase_s, bodies, units, reach, acquire, leash, habits, goal, real, whole, commands
+):
+    """The opponents choose their targets; then everyone's velocity for the next phase.
+
+    habits: help_m, patience_s.
+    """
+    d = units.shape[0]
+    now = np.empty((d, 4))
     for b in range(bodies.shape[0]):
         if not running[b]:
             continue
-        for j in range(n, whole.shape[1]):
+        for i in range(d):
+            for k in range(4):
+                now[i, k] = bodies[b, i, k]
+            real[b, i, OLD_X] = now[i, 0]
+            real[b, i, OLD_Y] = now[i, 1]
+        for j in range(n, d):
             if whole[b, j, ALIVE]:
                 _choose_target(
-                    n, j, phase_s, bodies[b], reach, acquire, leash, habits, goal, real[b], whole[b]
+                    b, n, j, phase_s, now, reach, acquire, leash, habits, goal, real, whole
                 )
-        for j in range(n, whole.shape[1]):
+        for j in range(n, d):
             whole[b, j, HITTER] = -1
-        for i in range(units.shape[0]):
-            real[b, i, OLD_X] = bodies[b, i, 0]
-            real[b, i, OLD_Y] = bodies[b, i, 1]
-            vx, vy = _wish(i, phase_s, bodies[b], units, reach, real[b], whole[b])
+        for i in range(d):
+            vx, vy = _wish(b, i, phase_s, now, units, reach, real, whole)
             commands[b, i, 0] = vx
             commands[b, i, 1] = vy
 
 
 @njit(cache=True)
 def _choose_target(  # type: ignore[no-untyped-def]
-    n, j, phase_s, bodies, reach, acquire, leash, habits, goal, real, whole
+    b, n, j, phase_s, now, reach, acquire, leash, habits, goal, real, whole
 ):
     """Attack-move: opponent j keeps its target while it can, else looks for one."""
     help_m, patience_s = habits
-    target = whole[j, TARGET]
+    target = whole[b, j, TARGET]
     if target >= 0:
-        distance = _distance(bodies, j, target)
-        real[j, CHASE] = 0.0 if distance <= reach[j, target] else real[j, CHASE] + phase_s
+        distance = _distance(now, j, target)
+        within = distance <= reach[j, target]
+        real[b, j, CHASE] = 0.0 if within else real[b, j, CHASE] + phase_s
         if distance > leash[j, target]:
             target = -1
-    if target < 0 or real[j, CHASE] > patience_s:
-        found = _look_around(n, j, bodies, acquire, help_m, whole)
+    if target < 0 or real[b, j, CHASE] > patience_s:
+        found = _look_around(b, n, j, now, acquire, help_m, whole)
         if found >= 0:
             target = found
-        real[j, CHASE] = 0.0
-    whole[j, TARGET] = target
+        real[b, j, CHASE] = 0.0
+    whole[b, j, TARGET] = target
     if target >= 0:
-        whole[j, ORDER] = ATTACK
+        whole[b, j, ORDER] = ATTACK
     else:
-        whole[j, ORDER] = GO
-        real[j, POINT_X] = goal[0]
-        real[j, POINT_Y] = goal[1]
+        whole[b, j, ORDER] = GO
+        real[b, j, POINT_X] = goal[0]
+        real[b, j, POINT_Y] = goal[1]
 
 
 @njit(cache=True)
-def _look_around(n, j, bodies, acquire, help_m, whole):  # type: ignore[no-untyped-def]
+def _look_around(b, n, j, now, acquire, help_m, whole):  # type: ignore[no-untyped-def]
     """The nearest robot within j's range, else one that hit j or a neighbour of j; -1: none."""
     best, nearest = np.inf, -1
     for i in range(n):
-        if whole[i, ALIVE]:
-            distance = _distance(bodies, i, j)
+        if whole[b, i, ALIVE]:
+            distance = _distance(now, i, j)
             if distance <= acquire[j, i] and distance < best:
                 best, nearest = distance, i
     if nearest >= 0:
         return nearest
     best = np.inf
-    for k in range(n, whole.shape[0]):
-        hitter = whole[k, HITTER]
-        if hitter >= 0 and whole[hitter, ALIVE]:
-            distance = _distance(bodies, j, k)
+    for k in range(n, whole.shape[1]):
+        hitter = whole[b, k, HITTER]
+        if hitter >= 0 and whole[b, hitter, ALIVE]:
+            distance = _distance(now, j, k)
             if distance <= help_m and distance < best:
                 best, nearest = distance, hitter
     return nearest
 
 
 @njit(cache=True)
-def _wish(i, phase_s, bodies, units, reach, real, whole):  # type: ignore[no-untyped-def]
+def _wish(b, i, phase_s, now, units, reach, real, whole):  # type: ignore[no-untyped-def]
     """The velocity with which unit i would follow its order if it were alone but for detours."""
-    order = whole[i, ORDER]
-    if not whole[i, ALIVE] or order == HALT or whole[i, NEXT_HIT] == 0:
+    order = whole[b, i, ORDER]
+    if not whole[b, i, ALIVE] or order == HALT or whole[b, i, NEXT_HIT] == 0:
         return 0.0, 0.0
     target = -1
     if order == GO:
-        dx, dy = real[i, POINT_X] - bodies[i, 0], real[i, POINT_Y] - bodies[i, 1]
+        dx, dy = real[b, i, POINT_X] - now[i, 0], real[b, i, POINT_Y] - now[i, 1]
     else:
-        target = whole[i, TARGET]
-        dx, dy = bodies[target, 0] - bodies[i, 0], bodies[target, 1] - bodies[i, 1]
+        target = whole[b, i, TARGET]
+        dx, dy = now[target, 0] - now[i, 0], now[target, 1] - now[i, 1]
     distance = np.sqrt(dx * dx + dy * dy)
     if distance < 1e-6:
         return 0.0, 0.0
@@ -165,56 +173,47 @@ def _wish(i, phase_s, bodies, units, reach, real, whole):  # type: ignore[no-unt
     way = distance
     if target >= 0:
         # What the target runs away in this phase has to be caught up too.
-        away = bodies[target, 2] * dx + bodies[target, 3] * dy
+        away = now[target, 2] * dx + now[target, 3] * dy
         way = distance - reach[i, target] + max(away, 0.0) * phase_s
         if way <= 0.0:
-            whole[i, SIDE] = 0
+            whole[b, i, SIDE] = 0
             return 0.0, 0.0
         way += SLACK_M
     speed = min(units[i, SPEED_MPS], way / phase_s)
-    dx, dy = _around(i, target, dx, dy, speed, bodies, units, whole)
+    dx, dy = _around(b, i, target, dx, dy, speed, now, units, whole)
     return speed * dx, speed * dy
 
 
 @njit(cache=True)
-def _around(i, target, dx, dy, speed, bodies, units, whole):  # type: ignore[no-untyped-def]
+def _around(b, i, target, dx, dy, speed, now, units, whole):  # type: ignore[no-untyped-def]
     """The direction (dx, dy), or along the edge of the unit that is in the way."""
-    blocker, most = -1, AHEAD
-    for k in range(whole.shape[0]):
-        if k == i or not whole[k, ALIVE]:
-            continue
-        if k == target:
-            continue
-        x, y = bodies[k, 0] - bodies[i, 0], bodies[k, 1] - bodies[i, 1]
+    most, blocked_x, blocked_y = AHEAD, 0.0, 0.0
+    for k in range(units.shape[0]):
+        x, y = now[k, 0] - now[i, 0], now[k, 1] - now[i, 1]
         near = units[i, BODY_RADIUS_M] + units[k, BODY_RADIUS_M] + WATCH_M
-        if abs(x) > near or abs(y) > near:
+        square = x * x + y * y
+        if square > near * near or square < 1e-12 or k == target or not whole[b, k, ALIVE]:
             continue
-        distance = np.sqrt(x * x + y * y)
-        if distance > near or distance < 1e-6:
-            continue
+        distance = np.sqrt(square)
         ahead = (x * dx + y * dy) / distance
-        pace = bodies[k, 2] * dx + bodies[k, 3] * dy
+        pace = now[k, 2] * dx + now[k, 3] * dy
         if ahead > most and pace < SAME_PACE * speed:
-            blocker, most = k, ahead
-    if blocker < 0:
-        whole[i, SIDE] = 0
+            most, blocked_x, blocked_y = ahead, x / distance, y / distance
+    if most == AHEAD:
+        whole[b, i, SIDE] = 0
         return dx, dy
-    x, y = bodies[blocker, 0] - bodies[i, 0], bodies[blocker, 1] - bodies[i, 1]
-    distance = np.sqrt(x * x + y * y)
-    x /= distance
-    y /= distance
-    if whole[i, SIDE] == 0:
+    if whole[b, i, SIDE] == 0:
         # The side on which less of the way is blocked; straight ahead, every other unit left.
-        cross = dx * y - dy * x
+        cross = dx * blocked_y - dy * blocked_x
         if abs(cross) > 1e-6:
-            whole[i, SIDE] = 1 if cross < 0.0 else -1
+            whole[b, i, SIDE] = 1 if cross < 0.0 else -1
         else:
-            whole[i, SIDE] = 1 if i % 2 == 0 else -1
-    side = whole[i, SIDE]
-    return -side * y, side * x
+            whole[b, i, SIDE] = 1 if i % 2 == 0 else -1
+    side = whole[b, i, SIDE]
+    return -side * blocked_y, side * blocked_x
 
 
 @njit(cache=True)
-def _distance(bodies, i, k):  # type: ignore[no-untyped-def]
-    x, y = bodies[k, 0] - bodies[i, 0], bodies[k, 1] - bodies[i, 1]
+def _distance(now, i, k):  # type: ignore[no-untyped-def]
+    x, y = now[k, 0] - now[i, 0], now[k, 1] - now[i, 1]
     return np.sqrt(x * x + y * y)
