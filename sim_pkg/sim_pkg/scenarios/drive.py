@@ -25,7 +25,7 @@ WALL_RADIUS_M = 0.5
 # Robots and boxes overlap by at most this when at rest against each other.
 SLOP_M = 0.005
 # Share of an overlap that is left after a second.
-PENETRATION_LEFT = 1e-6
+PENETRATION_LEFT = 1e-20
 
 Metres = Annotated[float, Field(gt=0, le=1000)]
 Point = tuple[Annotated[float, Field(ge=0, le=1000)], Annotated[float, Field(ge=0, le=1000)]]
