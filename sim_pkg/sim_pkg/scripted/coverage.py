@@ -91,16 +91,14 @@ def _act(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     n, m = seen_done.shape[1], seen_done.shape[2]
     sites, others = np.zeros((m, 2)), np.zeros((n - 1, 2))
-    here, velocity = np.zeros(2), np.zeros(2)
     for b in range(len(obs)):
         for i in range(n):
             row = obs[b, i]
-            for k in range(2):
-                velocity[k] = row[2 + k] * speed_mps
+            velocity = (row[2] * speed_mps, row[3] * speed_mps)
             _read_sites(row[4:], arena_m, sites, seen_done[b, i])
             read_others(row[4 + 4 * m :], sight_m, others)
             j = _choose(i, n, sites, others, seen_done[b, i], fills_holes, radius_m)
-            target = sites[j] if j >= 0 else here
+            target = (sites[j, 0], sites[j, 1]) if j >= 0 else (0.0, 0.0)
             actions[b, i] = drive_to(
                 target, velocity, others, apart_m, directions, speed_mps, accel_mps2, dt_s
             )

@@ -14,21 +14,21 @@ def drive_to(target, velocity, others, apart_m, directions, speed_mps, accel_mps
     """The action after which braking would end nearest to ``target`` and clear of ``others``.
 
     Looks one control step ahead, with limited acceleration. Positions are relative to the
-    robot, in m. target: (2,); velocity: (2,) m/s; others: (k, 2), rows with NaN are not there.
+    robot, in m. target: (x, y); velocity: (vx, vy) in m/s; others: (k, 2), NaN: not there.
     """
     best, best_cost = 0, np.inf
+    vx, vy = velocity
     for action in range(len(directions)):
-        change = speed_mps * directions[action] - velocity
-        norm = np.sqrt(change[0] * change[0] + change[1] * change[1])
-        limit = accel_mps2 * dt_s
-        if norm > limit:
-            change *= limit / norm
-        after = velocity + change
-        braking_s = np.sqrt(after[0] * after[0] + after[1] * after[1]) / (2.0 * accel_mps2)
-        end = (velocity + 0.5 * change) * dt_s + after * braking_s
-        cost = np.sqrt((end[0] - target[0]) ** 2 + (end[1] - target[1]) ** 2)
+        dx, dy = speed_mps * directions[action, 0] - vx, speed_mps * directions[action, 1] - vy
+        change = np.sqrt(dx * dx + dy * dy)
+        share = min(1.0, accel_mps2 * dt_s / change) if change > 0.0 else 0.0
+        dx, dy = dx * share, dy * share
+        braking_s = np.sqrt((vx + dx) ** 2 + (vy + dy) ** 2) / (2.0 * accel_mps2)
+        x = (vx + 0.5 * dx) * dt_s + (vx + dx) * braking_s
+        y = (vy + 0.5 * dy) * dt_s + (vy + dy) * braking_s
+        cost = np.sqrt((x - target[0]) ** 2 + (y - target[1]) ** 2)
         for k in range(len(others)):
-            gap = np.sqrt((end[0] - others[k, 0]) ** 2 + (end[1] - others[k, 1]) ** 2)
+            gap = np.sqrt((x - others[k, 0]) ** 2 + (y - others[k, 1]) ** 2)
             if gap < apart_m:
                 cost += AVOID * (apart_m - gap)
         if cost < best_cost - 1e-6:

@@ -74,21 +74,21 @@ class TransportPolicy:
         motion = (robot.max_speed_mps, robot.max_force_n / robot.mass_kg, config.dt_s)
         _act(
             obs, self._last_m, self._still, self._around, self._past, self._axis,
-            self._goes_around, np.array(config.arena_m), config.sight_m, self._rough_m,
+            self._goes_around, config.arena_m, config.sight_m, self._rough_m,
             self._via_m, self._half_m, self._reach_m, robot.radius_m, drive.DIRECTIONS, motion,
             actions,
         )  # fmt: skip
 
 
-def _way_around(config: TransportConfig) -> npt.NDArray[np.float64]:
-    """(2,) where the box passes the rough floor: north or south of it, where there is more room."""
+def _way_around(config: TransportConfig) -> tuple[float, float]:
+    """x, y where the box passes the rough floor: north or south of it, where there is more room."""
     if not config.floor.rough:
-        return np.array(config.goal)
+        return config.goal
     _, y1, x2, y2 = np.array(config.floor.rough).T
     south, north = y1.min(), y2.max()
     northwards = config.arena_m[1] - north >= south
     y = north + 2 * _BERTH_M if northwards else south - 2 * _BERTH_M
-    return np.array([x2.max() + 2 * _BERTH_M, y])
+    return float(x2.max() + 2 * _BERTH_M), float(y)
 
 
 @njit(cache=True)
@@ -134,8 +134,8 @@ def _count_still(place, box, last_m, still, reach_m):  # type: ignore[no-untyped
     the box moved meanwhile. ``last_m``: place of the robot, then of the box, when it last moved.
     """
     if (place[0] - last_m[0]) ** 2 + (place[1] - last_m[1]) ** 2 > _STILL_M**2:
-        last_m[:2] = place
-        last_m[2:] = box
+        last_m[0], last_m[1] = place
+        last_m[2], last_m[3] = box
         return 0
     gap = np.sqrt((place[0] - box[0]) ** 2 + (place[1] - box[1]) ** 2)
     pushed = np.sqrt((box[0] - last_m[2]) ** 2 + (box[1] - last_m[3]) ** 2)
@@ -147,14 +147,16 @@ def _count_still(place, box, last_m, still, reach_m):  # type: ignore[no-untyped
 
 @njit(cache=True)
 def _line_up(here, others, active, direction, half_m, radius_m):  # type: ignore[no-untyped-def]
-    """(along, beside, offset, all are behind) of a robot; places relative to the box, in m.
+    """(along, beside, offset, all are behind) of a robot.
+
+    ``here`` is relative to the box, ``others`` to the robot, in m.
 
     ``along`` the direction of the push and ``beside`` it; ``offset`` is the robot's place in
     the line, from the order in which the robots stand.
     """
-    across = np.array([-direction[1], direction[0]])
-    along = here[0] * direction[0] + here[1] * direction[1]
-    beside = here[0] * across[0] + here[1] * across[1]
+    dx, dy = direction
+    along = here[0] * dx + here[1] * dy
+    beside = here[1] * dx - here[0] * dy
     size, rank, ready = 1, 0, True
     for j in range(len(others)):
         if not active[j]:
@@ -163,8 +165,8 @@ def _line_up(here, others, active, direction, half_m, radius_m):  # type: ignore
         if np.isnan(others[j, 0]):
             ready = False
             continue
-        its_along = others[j, 0] * direction[0] + others[j, 1] * direction[1]
-        its_beside = others[j, 0] * across[0] + others[j, 1] * across[1]
+        its_along = (here[0] + others[j, 0]) * dx + (here[1] + others[j, 1]) * dy
+        its_beside = (here[1] + others[j, 1]) * dx - (here[0] + others[j, 0]) * dy
         if its_beside < beside:
             rank += 1
         behind = -half_m - 4.0 * radius_m < its_along < -half_m
@@ -176,12 +178,12 @@ def _line_up(here, others, active, direction, half_m, radius_m):  # type: ignore
 @njit(cache=True)
 def _approach(here, place, reach_m):  # type: ignore[no-untyped-def]
     """Where to go next on the way from ``here`` to ``place`` around the box, relative to it."""
-    step = place - here
-    length = step[0] * step[0] + step[1] * step[1]
+    dx, dy = place[0] - here[0], place[1] - here[1]
+    length = dx * dx + dy * dy
     nearest = 0.0
     if length > 0.0:
-        nearest = min(max(-(here[0] * step[0] + here[1] * step[1]) / length, 0.0), 1.0)
-    x, y = here[0] + nearest * step[0], here[1] + nearest * step[1]
+        nearest = min(max(-(here[0] * dx + here[1] * dy) / length, 0.0), 1.0)
+    x, y = here[0] + nearest * dx, here[1] + nearest * dy
     angle = np.arctan2(here[1], here[0])
     turn = np.arctan2(place[1], place[0]) - angle
     turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
@@ -189,7 +191,7 @@ def _approach(here, place, reach_m):  # type: ignore[no-untyped-def]
         return place
     angle += _ARC_RAD if turn > 0.0 else -_ARC_RAD
     radius = reach_m + 2.0 * _CLEARANCE_M
-    return np.array([radius * np.cos(angle), radius * np.sin(angle)])
+    return radius * np.cos(angle), radius * np.sin(angle)
 
 
 @njit(cache=True)
@@ -207,7 +209,7 @@ def _towards(x, y, directions):  # type: ignore[no-untyped-def]
 def _push(  # type: ignore[no-untyped-def]
     here, velocity, others, active, direction, half_m, reach_m, radius_m, directions, motion
 ):
-    """A robot's action; places relative to the box, in m."""
+    """A robot's action; ``here`` is relative to the box, ``others`` to the robot, in m."""
     along, beside, offset, ready = _line_up(here, others, active, direction, half_m, radius_m)
     if ready and along < -half_m and abs(beside - offset) < _LANE_M:
         aside = offset - beside
@@ -215,17 +217,15 @@ def _push(  # type: ignore[no-untyped-def]
         y = _AHEAD_M * direction[1] + aside * direction[0]
         return _towards(x, y, directions)
     depth = half_m + radius_m + _CLEARANCE_M
-    place = np.array(
-        [
-            -depth * direction[0] - offset * direction[1],
-            -depth * direction[1] + offset * direction[0],
-        ]
+    place = (
+        -depth * direction[0] - offset * direction[1],
+        -depth * direction[1] + offset * direction[0],
     )
-    target = _approach(here, place, reach_m) - here
+    x, y = _approach(here, place, reach_m)
     speed_mps, accel_mps2, dt_s = motion
     return drive_to(
-        target, velocity, others - here, 2.0 * radius_m + _SPACING_M, directions, speed_mps,
-        accel_mps2, dt_s,
+        (x - here[0], y - here[1]), velocity, others, 2.0 * radius_m + _SPACING_M, directions,
+        speed_mps, accel_mps2, dt_s,
     )  # fmt: skip
 
 
@@ -239,30 +239,34 @@ def _act(  # type: ignore[no-untyped-def]
     active = np.ones(n - 1, dtype=np.bool_)
     for b in range(len(obs)):
         for i in range(n):
-            row = obs[b, i].astype(np.float64)
-            own = (row[:2] + 1.0) * 0.5 * arena_m
-            box, goal = own + row[4:6] * arena_m, own + row[10:12] * arena_m
+            row = obs[b, i]
+            x, y = 0.5 * (row[0] + 1.0) * arena_m[0], 0.5 * (row[1] + 1.0) * arena_m[1]
+            here = (-row[4] * arena_m[0], -row[5] * arena_m[1])
+            box = (x - here[0], y - here[1])
+            goal = (x + row[10] * arena_m[0], y + row[11] * arena_m[1])
             read_others(row[12:], sight_m, others)
             for k in range(n - 1):
                 j = k if k < i else k + 1
                 if not np.isnan(others[k, 0]):
+                    place = (x + others[k, 0], y + others[k, 1])
                     still[b, i, j] = _count_still(
-                        own + others[k], box, last_m[b, i, j], still[b, i, j], reach_m
+                        place, box, last_m[b, i, j], still[b, i, j], reach_m
                     )
                 active[k] = still[b, i, j] < _LEFT_OUT
             if goes_around and not around[b, i] and not active.all():
                 around[b, i], axis[b, i] = True, -1
             past[b, i] |= not _crosses(box, goal, rough, _BERTH_M)
             detour = around[b, i] and not past[b, i]
+            target = via if detour else goal
             angle = np.arctan2(row[7], row[6])
             axis[b, i] = _axis(
-                (via if detour else goal) - box, angle, axis[b, i], 1 if detour else -1
+                (target[0] - box[0], target[1] - box[1]), angle, axis[b, i], 1 if detour else -1
             )
             angle += 0.5 * np.pi * axis[b, i]
             actions[b, i] = _push(
-                own - box, row[2:4] * motion[0], others + (own - box), active,
-                np.array([np.cos(angle), np.sin(angle)]), half_m[axis[b, i] % 2], reach_m,
-                radius_m, directions, motion,
+                here, (row[2] * motion[0], row[3] * motion[0]), others, active,
+                (np.cos(angle), np.sin(angle)), half_m[axis[b, i] % 2], reach_m, radius_m,
+                directions, motion,
             )  # fmt: skip
 
 
