@@ -210,3 +210,21 @@ def test_worlds_memory_is_never_replaced() -> None:
     assert world.bodies.__array_interface__["data"][0] == address
     assert np.ptp(world.bodies[1, :, 0]) > 0
     np.testing.assert_array_equal(world.bodies[0], 0.0)
+
+
+def test_a_disc_that_is_taken_out_collides_with_nothing_and_keeps_its_row() -> None:
+    velocities = np.zeros((8, 5, 2))
+    velocities[:, 0, 0] = 1.0  # the first runs into the second
+    world = World(SPEC, 1)
+    blocked = run(world, 0, velocities)
+    assert np.abs(blocked[-1, 1, :2] - STARTS_M[1]).max() > 0.1
+    world.place(0, STARTS_M)
+    world.take_out(0, 1)
+    running = np.ones(1, dtype=np.bool_)
+    for velocity in velocities:
+        world.commands[0] = velocity
+        world.advance(running)
+    np.testing.assert_allclose(world.bodies[0, 0, :2], STARTS_M[0] + (4.0, 0.0), atol=1e-9)
+    np.testing.assert_array_equal(world.bodies[0, 1:, :2], STARTS_M[1:])
+    # The next episode has it again.
+    np.testing.assert_array_equal(run(world, 0, velocities), blocked)
