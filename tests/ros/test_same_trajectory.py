@@ -22,16 +22,25 @@ CONDITIONS = {
 }
 
 
+def untrained(folder: Path, scenario: str) -> Path:
+    write_untrained(folder / "step_0", make_env(scenario, 1).spec, seed=4)
+    return folder / "step_0"
+
+
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("team") / "step_0"
-    write_untrained(folder, make_env("buttons", 1).spec, seed=4)
-    return folder
+    return untrained(tmp_path_factory.mktemp("team"), "buttons")
 
 
-def compare(checkpoint: Path, condition: Condition, layout: Layout, episodes: int) -> None:
-    expected = evaluate(load_policy(checkpoint), "buttons", condition, episodes, SEED)
-    got = evaluate_via_ros(checkpoint, "buttons", condition, episodes, SEED, layout)
+def compare(
+    checkpoint: Path,
+    condition: Condition,
+    layout: Layout,
+    episodes: int,
+    scenario: str = "buttons",
+) -> None:
+    expected = evaluate(load_policy(checkpoint), scenario, condition, episodes, SEED)
+    got = evaluate_via_ros(checkpoint, scenario, condition, episodes, SEED, layout)
     assert got.summary() == expected.summary()
     assert (got.condition, got.robots, got.seed) == (
         expected.condition,
@@ -55,6 +64,12 @@ def compare(checkpoint: Path, condition: Condition, layout: Layout, episodes: in
 )
 def test_core_and_ros_give_the_same_bits(checkpoint: Path, layout: Layout, condition: str) -> None:
     compare(checkpoint, CONDITIONS[condition], layout, episodes=4)
+
+
+@pytest.mark.parametrize("scenario", ["coverage", "transport"])
+def test_every_kind_of_scenario(tmp_path: Path, scenario: str) -> None:
+    checkpoint = untrained(tmp_path, scenario)
+    compare(checkpoint, CONDITIONS["rate"], "single", episodes=2, scenario=scenario)
 
 
 @pytest.mark.soak
