@@ -228,3 +228,27 @@ def test_a_disc_that_is_taken_out_collides_with_nothing_and_keeps_its_row() -> N
     np.testing.assert_array_equal(world.bodies[0, 1:, :2], STARTS_M[1:])
     # The next episode has it again.
     np.testing.assert_array_equal(run(world, 0, velocities), blocked)
+
+
+def test_energy_fades_when_nothing_drives() -> None:
+    """Knocks, dry friction and braking drives: the kinetic energy never grows."""
+    spec = replace(HEAVY, discs=tuple(replace(d, drive_n=2.0) for d in HEAVY.discs[:4]))
+    world = World(spec, 1)
+    world.place(0, np.concatenate((STARTS_M[:4], BOX_M)))
+    masses = np.array([d.mass_kg for d in spec.discs] + [20.0])
+    inertia = 20.0 * (1.2**2 + 0.8**2) / 12
+    fades = 0
+    for velocities in commands(8, 30)[:, :4]:
+        world.commands[0], world.floor_n[0] = velocities, 1.0
+        for _ in range(6):
+            world.advance(np.ones(1, dtype=np.bool_))
+        world.commands[0] = 0.0
+        energy = np.inf
+        for _ in range(4):
+            world.advance(np.ones(1, dtype=np.bool_))
+            speeds = (world.bodies[0, :, 2:] ** 2).sum(axis=1)
+            now = float((masses * speeds).sum() + inertia * world.turns[0, 4, 1] ** 2) / 2
+            assert now <= energy + 1e-12  # rounding, at rest
+            fades += now + 1e-6 < energy < np.inf
+            energy = now
+    assert fades > 30, "everything was at rest: the test is void"
