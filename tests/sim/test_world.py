@@ -238,7 +238,7 @@ def test_energy_fades_when_nothing_drives() -> None:
     masses = np.array([d.mass_kg for d in spec.discs] + [20.0])
     inertia = 20.0 * (1.2**2 + 0.8**2) / 12
     fades = 0
-    for velocities in commands(8, 30)[:, :4]:
+    for velocities in commands(8, 60)[:, :4]:
         world.commands[0], world.floor_n[0] = velocities, 1.0
         for _ in range(6):
             world.advance(np.ones(1, dtype=np.bool_))
