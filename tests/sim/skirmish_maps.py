@@ -53,7 +53,7 @@ class Duel:
         self.tables = Tables.of(config)
         self.n = len(config.robots)
         self.fight = Fight.allocate(self.tables, 1)
-        starts_m = self.fight.begin(self.tables, 0, self.n, np.random.default_rng(0))
+        starts_m = self.fight.begin(self.tables, 0, np.random.default_rng(0))
         self.bodies = np.zeros((1, len(starts_m), 4))
         self.bodies[0, :, :2] = starts_m
         self.running = np.ones(1, dtype=np.bool_)
@@ -71,7 +71,7 @@ class Duel:
         t, f = self.tables, self.fight
         skirmish_combat.fight(
             self.running, 1, TICK_S, self.bodies, t.units, t.hits_s, t.damage, t.reach_m,
-            f.extras_s, f.real, f.whole, hits,
+            f.extras_s, f.clock_s, f.real, f.whole, hits,
         )  # fmt: skip
         return hits[0]
 

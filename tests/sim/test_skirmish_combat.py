@@ -10,7 +10,7 @@ from skirmish_maps import Duel, Placed, load_map, write_map
 
 from sim_pkg.env import make_env
 from sim_pkg.scenarios.skirmish_layout import FIRST_ATTACK, STATE_COOLDOWN, STOP
-from sim_pkg.scenarios.skirmish_tables import ALIVE, CHASE, HEALTH, HITTER, QUIET, SHIELD, WAIT
+from sim_pkg.scenarios.skirmish_tables import ALIVE, CHASE, HEALTH, HITTER, HURT, READY, SHIELD
 
 TICK_S = 1 / 16
 FAR = ("dummy", 30.0, 30.0)
@@ -108,7 +108,7 @@ def test_shields_come_back_ten_seconds_after_the_last_damage(tmp_path: Path) -> 
     for _ in range(100):
         fight.tick()
     assert real[SHIELD] == 50.0
-    real[QUIET], real[HEALTH] = 0.0, 50.0
+    real[HURT], real[HEALTH] = fight.fight.clock_s[0], 50.0
     for _ in range(400):
         fight.tick()
     assert real[HEALTH] == 50.0, "health never comes back"
@@ -138,7 +138,7 @@ def test_another_order_breaks_an_attack_off_before_its_first_hit(tmp_path: Path)
     fight.order([FIRST_ATTACK])
     assert fight.winding_up(0), "the same order again changes nothing"
     fight.order([STOP])
-    assert fight.fight.real[0, 0, WAIT] == 0.0
+    assert fight.fight.real[0, 0, READY] == 0.0
     assert sum(fight.tick()[0, 1] for _ in range(20)) == 0.0
     fight.order([FIRST_ATTACK])
     assert [fight.tick()[0, 1] for _ in range(4)] == [0, 0, 0, 10]

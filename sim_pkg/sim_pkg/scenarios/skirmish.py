@@ -23,7 +23,7 @@ from sim_pkg.scenarios import skirmish_brake, skirmish_combat, skirmish_observe,
 from sim_pkg.scenarios.base import Buffers, Kind, Scene, episode_rng, robot_names
 from sim_pkg.scenarios.skirmish_config import PHASES, TICK_S, SkirmishConfig
 from sim_pkg.scenarios.skirmish_layout import NO_OP, STOP
-from sim_pkg.scenarios.skirmish_tables import ALIVE, MAX_HEALTH, MAX_SHIELD, Fight, Tables
+from sim_pkg.scenarios.skirmish_tables import ALIVE, Fight, Tables
 from sim_pkg.world import DiscSpec, Float64Array, World, WorldSpec
 
 WALL_RADIUS_M = 1.0
@@ -47,9 +47,9 @@ class Skirmish:
         self._phase_s = config.dt_s / PHASES
         self._phase = 0
         self._habits = (config.behaviour.help_m, config.behaviour.patience_s)
-        theirs = tables.units[self._n :, MAX_HEALTH : MAX_SHIELD + 1]
+        health, count = tables.standing
         self._full_reward = (
-            theirs.sum() + skirmish_observe.REWARD_KILL * len(theirs) + skirmish_observe.REWARD_WIN
+            health + skirmish_observe.REWARD_KILL * count + skirmish_observe.REWARD_WIN
         )
         self.spec = EnvSpec(
             scenario=name,
@@ -73,15 +73,15 @@ class Skirmish:
     def begin(self, arena: int, seed: int, episode: int) -> Float64Array:
         """All whole and at their starts."""
         self._inside[arena] = True
-        return self._fight.begin(self._tables, arena, self._n, episode_rng(seed, episode))
+        return self._fight.begin(self._tables, arena, episode_rng(seed, episode))
 
     def observe(self, running: BoolArray, world: World, out: Buffers) -> None:
         tables, fight, layout = self._tables, self._fight, self.layout
         shields = (int(layout.robot_shields), int(layout.opponent_shields))
         skirmish_observe.observe(
             running, self._n, shields, world.bodies, tables.units, tables.type_bits,
-            tables.free_m, self.config.arena_m, fight.real, fight.whole, out.obs, out.state,
-            out.available,
+            tables.free_m, self.config.arena_m, fight.clock_s, fight.real, fight.whole, out.obs,
+            out.state, out.available,
         )  # fmt: skip
 
     def command(self, running: BoolArray, actions: IntArray, world: World) -> None:
@@ -118,7 +118,8 @@ class Skirmish:
         tables, fight = self._tables, self._fight
         deaths = skirmish_combat.fight(
             running, round(self._phase_s / TICK_S), TICK_S, world.bodies, tables.units,
-            tables.hits_s, tables.damage, tables.reach_m, fight.extras_s, fight.real, fight.whole,
+            tables.hits_s, tables.damage, tables.reach_m, fight.extras_s, fight.clock_s,
+            fight.real, fight.whole,
             self._hits,
         )  # fmt: skip
         if deaths:

@@ -5,7 +5,8 @@ Chipmunk notices two discs only when they overlap already, up to a substep's way
 before the physics: in one phase no pair comes closer than touching. The units brake, as a robot
 with a proximity sensor does, and are not pushed: who stands stays.
 
-Shapes and columns as in skirmish_tables.py.
+Shapes and columns as in skirmish_tables.py. Helpers are inlined where the call, which hands over
+every array, costs more than they do.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ def _settle(near, phase_s, units, free, now, pairs):  # type: ignore[no-untyped-
     _brake_at_walls(phase_s, units, free, now)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _brake_pair(pair, slide, phase_s, now, pairs):  # type: ignore[no-untyped-def]
     """Whether the two had to brake, in proportion to what each contributes to the approach."""
     i, k = int(pairs[pair, FIRST]), int(pairs[pair, SECOND])
@@ -115,7 +116,7 @@ def _brake_pair(pair, slide, phase_s, now, pairs):  # type: ignore[no-untyped-de
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _slow(i, slide, share, x, y, now):  # type: ignore[no-untyped-def]
     """Takes ``share`` off the part (x, y) of i's velocity, or off all of it."""
     if slide:

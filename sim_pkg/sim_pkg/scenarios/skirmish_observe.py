@@ -27,8 +27,8 @@ from sim_pkg.scenarios.skirmish_tables import (
     LAST_ACTION,
     MAX_HEALTH,
     MAX_SHIELD,
+    READY,
     SHIELD,
-    WAIT,
 )
 
 REWARD_KILL, REWARD_WIN, REWARD_SUM = 10.0, 200.0, 20.0
@@ -67,7 +67,20 @@ def score(  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def observe(  # type: ignore[no-untyped-def]
-    running, n, shields, bodies, units, types, free, arena_m, real, whole, obs, state, available
+    running,
+    n,
+    shields,
+    bodies,
+    units,
+    types,
+    free,
+    arena_m,
+    clock_s,
+    real,
+    whole,
+    obs,
+    state,
+    available,
 ):
     """``shields``: whether features for the robots', the opponents' shields exist."""
     d = units.shape[0]
@@ -81,7 +94,7 @@ def observe(  # type: ignore[no-untyped-def]
             now[i, 2] = real[b, i, HEALTH] / units[i, MAX_HEALTH]
             most = units[i, MAX_SHIELD]
             now[i, 3] = real[b, i, SHIELD] / most if most > 0.0 else 0.0
-        _state(b, n, shields, now, units, types, arena_m, real, whole, state)
+        _state(b, n, shields, now, units, types, arena_m, clock_s[b], real, whole, state)
         for i in range(n):
             for k in range(obs.shape[2]):
                 obs[b, i, k] = 0.0
@@ -145,7 +158,7 @@ def _look(b, i, n, shields, now, types, whole, obs, available):  # type: ignore[
 
 
 @njit(cache=True)
-def _state(b, n, shields, now, units, types, arena_m, real, whole, state):  # type: ignore[no-untyped-def]
+def _state(b, n, shields, now, units, types, arena_m, clock_s, real, whole, state):  # type: ignore[no-untyped-def]
     for k in range(state.shape[1]):
         state[b, k] = 0.0
     at = 0
@@ -155,7 +168,8 @@ def _state(b, n, shields, now, units, types, arena_m, real, whole, state):  # ty
         if whole[b, j, ALIVE]:
             state[b, at] = now[j, 2]
             if j < n:
-                state[b, at + 1] = real[b, j, WAIT] / (units[j, COOLDOWN_S] + EXTRA_S[1])
+                wait_s = max(real[b, j, READY] - clock_s, 0.0)
+                state[b, at + 1] = wait_s / (units[j, COOLDOWN_S] + EXTRA_S[1])
             for axis in range(2):
                 state[b, place + axis] = now[j, axis] / arena_m[axis] - 0.5
             if shield:

@@ -4,7 +4,8 @@ Before the physics of a phase each unit gets a velocity: to the point it was ord
 towards its target until that is within reach. Whoever has something in the way goes around it, on
 one side until the way is free. skirmish_brake.py then keeps them from running into each other.
 
-Shapes and columns as in skirmish_tables.py.
+Shapes and columns as in skirmish_tables.py. Helpers are inlined where the call, which hands over
+every array, costs more than they do.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ from sim_pkg.scenarios.skirmish_tables import (
     ORDER,
     POINT_X,
     POINT_Y,
+    READY,
     SIDE,
     SPEED_MPS,
     TARGET,
-    WAIT,
 )
 
 # North, south, east, west.
@@ -40,6 +41,7 @@ WAYS = np.array([(0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0)])
 SLACK_M = 0.02  # a chaser aims this far inside its reach
 WATCH_M = 0.35  # what is nearer than this, edge to edge, can be in the way
 AHEAD = 0.5  # cosine of the angle within which it is
+GONE_M = 1e9  # where the dead are: in nobody's way
 SAME_PACE = 0.8  # what goes the same way at this share of one's speed is not in the way
 
 
@@ -70,7 +72,7 @@ def take_orders(running, actions, bodies, real, whole):  # type: ignore[no-untyp
                 target = n + action - FIRST_ATTACK
             if target != unit[TARGET] and unit[NEXT_HIT] == 0:
                 unit[NEXT_HIT] = -1
-                real[b, i, WAIT] = 0.0
+                real[b, i, READY] = 0.0
             unit[TARGET] = target
 
 
@@ -83,15 +85,18 @@ def drive(  # type: ignore[no-untyped-def]
     habits: help_m, patience_s.
     """
     d = units.shape[0]
-    now = np.empty((d, 4))
+    now = np.empty((d, 5))  # x, y, vx, vy, radius
     for b in range(bodies.shape[0]):
         if not running[b]:
             continue
         for i in range(d):
             for k in range(4):
                 now[i, k] = bodies[b, i, k]
+            now[i, 4] = units[i, BODY_RADIUS_M]
             real[b, i, OLD_X] = now[i, 0]
             real[b, i, OLD_Y] = now[i, 1]
+            if not whole[b, i, ALIVE]:
+                now[i, 0] = GONE_M
         for j in range(n, d):
             if whole[b, j, ALIVE]:
                 _choose_target(
@@ -153,7 +158,7 @@ def _look_around(b, n, j, now, acquire, help_m, whole):  # type: ignore[no-untyp
     return nearest
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _wish(b, i, phase_s, now, units, reach, real, whole):  # type: ignore[no-untyped-def]
     """The velocity with which unit i would follow its order if it were alone but for detours."""
     order = whole[b, i, ORDER]
@@ -180,19 +185,20 @@ def _wish(b, i, phase_s, now, units, reach, real, whole):  # type: ignore[no-unt
             return 0.0, 0.0
         way += SLACK_M
     speed = min(units[i, SPEED_MPS], way / phase_s)
-    dx, dy = _around(b, i, target, dx, dy, speed, now, units, whole)
+    dx, dy = _around(b, i, target, dx, dy, speed, now, whole)
     return speed * dx, speed * dy
 
 
-@njit(cache=True)
-def _around(b, i, target, dx, dy, speed, now, units, whole):  # type: ignore[no-untyped-def]
+@njit(cache=True, inline="always")
+def _around(b, i, target, dx, dy, speed, now, whole):  # type: ignore[no-untyped-def]
     """The direction (dx, dy), or along the edge of the unit that is in the way."""
     most, blocked_x, blocked_y = AHEAD, 0.0, 0.0
-    for k in range(units.shape[0]):
+    watch = now[i, 4] + WATCH_M
+    for k in range(now.shape[0]):
         x, y = now[k, 0] - now[i, 0], now[k, 1] - now[i, 1]
-        near = units[i, BODY_RADIUS_M] + units[k, BODY_RADIUS_M] + WATCH_M
+        near = watch + now[k, 4]
         square = x * x + y * y
-        if square > near * near or square < 1e-12 or k == target or not whole[b, k, ALIVE]:
+        if square > near * near or square < 1e-12 or k == target:
             continue
         distance = np.sqrt(square)
         ahead = (x * dx + y * dy) / distance
@@ -213,7 +219,7 @@ def _around(b, i, target, dx, dy, speed, now, units, whole):  # type: ignore[no-
     return -side * blocked_y, side * blocked_x
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _distance(now, i, k):  # type: ignore[no-untyped-def]
     x, y = now[k, 0] - now[i, 0], now[k, 1] - now[i, 1]
     return np.sqrt(x * x + y * y)

@@ -21,11 +21,11 @@ from sim_pkg.world import Float64Array
 ) = range(10)  # fmt: skip
 
 # Of a unit, changing: (B, d, REAL_COLUMNS) float64.
-# WAIT: seconds until the next attack may start. SINCE: seconds since the present attack started.
-# QUIET: seconds since the last damage. OLD: where it was when the phase began. POINT: where it
-# was ordered to go. CHASE: seconds for which an opponent's target has been out of its reach.
+# READY, STARTED and HURT are times of the arena's clock: when its next attack may start, when its
+# present one did, when it was last hit. OLD: where it was when the phase began. POINT: where it was
+# ordered to go. CHASE: seconds for which an opponent's target has been out of its reach.
 (
-    HEALTH, SHIELD, WAIT, SINCE, QUIET, OLD_X, OLD_Y, POINT_X, POINT_Y, CHASE, REAL_COLUMNS,
+    HEALTH, SHIELD, READY, STARTED, HURT, OLD_X, OLD_Y, POINT_X, POINT_Y, CHASE, REAL_COLUMNS,
 ) = range(11)  # fmt: skip
 
 # Of a unit, changing: (B, d, WHOLE_COLUMNS) int32; discs by number, -1: none.
@@ -38,6 +38,11 @@ ALIVE, ORDER, TARGET, VICTIM, NEXT_HIT, ATTACKS, HITTER, SIDE, LAST_ACTION, WHOL
 
 # Values of ORDER.
 HALT, GO, ATTACK = range(3)
+
+# A whole row when an episode begins.
+FRESH = np.full(WHOLE_COLUMNS, -1, dtype=np.int32)
+FRESH[ALIVE] = 1
+FRESH[[ORDER, ATTACKS, SIDE]] = HALT, 0, 0
 
 # A random extra on the cooldown of each attack.
 EXTRA_S = (-0.0625, 0.125)
@@ -57,12 +62,14 @@ class Tables:
     free_m: Float64Array  # (4,) x1, y1, x2, y2
     goal_m: Float64Array  # (2,) where the opponents go
     type_bits: FloatArray  # (d, number of type names)
+    standing: tuple[float, int]  # the opponents' health and shield together; how many they are
     jitter_m: float  # of the starts, in x and y
     n_attacks: int  # more than a unit can start in an episode
 
     @classmethod
     def of(cls, config: SkirmishConfig) -> Tables:
         units, layout = config.units, config.layout
+        theirs = units[len(config.robots) :]
         h = max(len(unit.hits_s) for unit in units)
         hits_s = np.full((len(units), h), np.inf)
         for row, unit in zip(hits_s, units, strict=True):
@@ -86,6 +93,7 @@ class Tables:
             free_m=np.array(config.free_m),
             goal_m=starts_m[: len(config.robots)].mean(axis=0),
             type_bits=np.array([layout.type_bits(p.unit) for p in config.placed]),
+            standing=(sum(u.health + u.shield for u in theirs), len(theirs)),
             jitter_m=config.jitter_m,
             n_attacks=int(seconds / shortest_s) + 2,
         )
@@ -112,6 +120,7 @@ class Fight:
     real: Float64Array  # (B, d, REAL_COLUMNS)
     whole: IntArray  # (B, d, WHOLE_COLUMNS)
     extras_s: Float64Array  # (B, d, n_attacks) random extra on the cooldown of each attack
+    clock_s: Float64Array  # (B,)
     steps: IntArray  # (B,)
     standing: Float64Array  # (B, 2) the opponents' health and shield together; how many live
 
@@ -122,29 +131,24 @@ class Fight:
             real=np.zeros((b, d, REAL_COLUMNS)),
             whole=np.zeros((b, d, WHOLE_COLUMNS), dtype=np.int32),
             extras_s=np.zeros((b, d, tables.n_attacks)),
+            clock_s=np.zeros(b),
             steps=np.zeros(b, dtype=np.int32),
             standing=np.zeros((b, 2)),
         )
 
-    def begin(
-        self, tables: Tables, arena: int, n_robots: int, rng: np.random.Generator
-    ) -> Float64Array:
+    def begin(self, tables: Tables, arena: int, rng: np.random.Generator) -> Float64Array:
         """All whole and at their starts, nobody ordered. (d, 2) where they start."""
-        units, real, whole = tables.units, self.real[arena], self.whole[arena]
+        real, whole = self.real[arena], self.whole[arena]
         shift_m = rng.uniform(-tables.jitter_m, tables.jitter_m, tables.starts_m.shape)
         starts_m: Float64Array = tables.starts_m + shift_m
         real[:] = 0.0
-        real[:, HEALTH] = units[:, MAX_HEALTH]
-        real[:, SHIELD] = units[:, MAX_SHIELD]
+        real[:, HEALTH : SHIELD + 1] = tables.units[:, MAX_HEALTH : MAX_SHIELD + 1]
         real[:, OLD_X : OLD_Y + 1] = starts_m
-        whole[:] = -1
-        whole[:, ALIVE] = 1
-        whole[:, ORDER] = HALT
-        whole[:, ATTACKS] = whole[:, SIDE] = 0
+        whole[:] = FRESH
         rng.random(out=self.extras_s[arena])
         self.extras_s[arena] *= EXTRA_S[1] - EXTRA_S[0]
         self.extras_s[arena] += EXTRA_S[0]
+        self.clock_s[arena] = 0.0
         self.steps[arena] = 0
-        theirs = units[n_robots:]
-        self.standing[arena] = theirs[:, MAX_HEALTH : MAX_SHIELD + 1].sum(), len(theirs)
+        self.standing[arena] = tables.standing
         return starts_m
