@@ -20,7 +20,7 @@ check: setup ## ruff, mypy, the architecture's laws, the documents' commands
 	$(IN_ENV) pytest tests/test_architecture.py tests/test_documents.py
 
 test: setup ## the test suite, under 5 minutes on 2 cores
-	$(IN_ENV) pytest -m "not soak" -n 2 --dist loadfile
+	$(IN_ENV) pytest -m "not soak" -n 2 --dist loadfile --max-worker-restart 0
 
 demo: setup ## train two teams, run them as ROS graphs, crash robots, read off the cost
 	$(IN_ENV) crash-coach demo $(DEMO_OPTIONS)

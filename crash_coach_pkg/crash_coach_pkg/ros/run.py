@@ -49,7 +49,7 @@ def spin(start: Callable[[Executor], Node]) -> int:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, note)
-    node = None
+    executor = node = None
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         executor = EventsExecutor()
@@ -62,6 +62,9 @@ def spin(start: Callable[[Executor], Node]) -> int:
         print(f"{program}: error: {error}", file=sys.stderr)  # noqa: T201
         return 1
     finally:
+        # In this order: DDS must not call back into what is gone (the executor first lets go).
+        if executor is not None:
+            executor.shutdown()
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()

@@ -103,6 +103,7 @@ def spin(make_node: Callable[[], AgentNode]) -> int:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, note)
+    executor = node = None
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         executor = EventsExecutor()
@@ -118,5 +119,10 @@ def spin(make_node: Callable[[], AgentNode]) -> int:
         print(f"{program}: error: {error}", file=sys.stderr)  # noqa: T201
         return 1
     finally:
+        # In this order: DDS must not call back into what is gone (the executor first lets go).
+        if executor is not None:
+            executor.shutdown()
+        if node is not None:
+            node.destroy_node()
         rclpy.try_shutdown()
     return 0

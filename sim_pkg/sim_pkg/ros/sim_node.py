@@ -263,11 +263,14 @@ def _run(stopped: list[int]) -> str | None:
     node = SimNode()
     executor = EventsExecutor()
     executor.add_node(node)
-    while not stopped and not node.done:
-        executor.spin_once(timeout_sec=_SPIN_S)
-    node.finish()
-    executor.remove_node(node)
-    node.destroy_node()
+    try:
+        while not stopped and not node.done:
+            executor.spin_once(timeout_sec=_SPIN_S)
+        node.finish()
+    finally:
+        # In this order: DDS must not call back into what is gone (the executor first lets go).
+        executor.shutdown()
+        node.destroy_node()
     return node.failure
 
 

@@ -33,6 +33,11 @@ class GraphClient:
         self._executor = EventsExecutor(context=context)
         self._executor.add_node(node)
 
+    def close(self) -> None:
+        """The executor lets go before the node goes: DDS must not call back into what is gone."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+
     def until(self, ready: Callable[[], bool], timeout_s: float, what: str) -> None:
         """Serves the node's callbacks until ``ready()``. Raises WaitError naming ``what``."""
         deadline = time.monotonic() + timeout_s
@@ -102,6 +107,10 @@ def graph_client(
     context.init(args=[], domain_id=domain)
     try:
         node = Node(name, context=context, use_global_arguments=False)
-        yield GraphClient(node, context, check)
+        client = GraphClient(node, context, check)
+        try:
+            yield client
+        finally:
+            client.close()
     finally:
         context.try_shutdown()

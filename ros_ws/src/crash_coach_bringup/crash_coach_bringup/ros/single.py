@@ -61,6 +61,8 @@ def _run(received: list[int]) -> None:
             raise UserError(sim.failure)
         sim.finish()
     finally:
+        # In this order: DDS must not call back into what is gone (the executor first lets go).
+        executor.shutdown()
         for node in (coach, gate, team, sim):
             node.destroy_node()
 
