@@ -24,9 +24,9 @@ from sim_pkg.scenarios.skirmish_orders import WAYS
 # SEEN: 1 or 0. CAN: an attack may be ordered. LEFT: health and shield together.
 SEEN, CAN, X, Y, AWAY, LEFT, VIEW_COLUMNS = range(7)
 
-LOOK_S = 1.5  # how far ahead a fleeing robot looks
+LOOK_S = 3.0  # how far ahead a fleeing robot looks
 KEEP_M = 0.6  # of distance that going on in the same direction is worth: turns cost way
-TURN_M = 0.3  # ... and that going around the opponents on the left is: out of corners
+TURN_M = 1.0  # ... and that going around the opponents on one side is: out of corners
 
 
 @njit(cache=True)
@@ -52,6 +52,19 @@ def least(view, which, of):  # type: ignore[no-untyped-def]
         if view[j, which] > 0.0 and view[j, of] < best:
             best, found = view[j, of], j
     return found
+
+
+@njit(cache=True)
+def pick(view, reach):  # type: ignore[no-untyped-def]
+    """The weakest opponent within ``reach`` (m,), else the nearest that may be attacked; -1: none.
+
+    An attack on one that is farther away is a walk.
+    """
+    best, found = np.inf, -1
+    for j in range(view.shape[0]):
+        if view[j, CAN] > 0.0 and view[j, AWAY] <= reach[j] and view[j, LEFT] < best:
+            best, found = view[j, LEFT], j
+    return found if found >= 0 else least(view, CAN, AWAY)
 
 
 @njit(cache=True)
