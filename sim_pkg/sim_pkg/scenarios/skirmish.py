@@ -3,8 +3,9 @@
 A control step of ``dt_s`` has two phases. In each, every unit is commanded a velocity, the physics
 advances, and the fight goes on for the phase's ticks of 1/16 s (skirmish_combat.py), with each
 unit on the straight line between its places before and after. So a chaser corrects its course
-every 0.25 s and a shot's moment is exact to a tick, whatever the physics' substeps are. Once per
-step was too coarse: at 0.5 s a zealot that follows a stalker aims 1.5 m behind it.
+every 0.25 s and a shot's moment is exact to a tick, whatever the physics' substeps are. Two phases
+are a compromise: with one, zealots lag behind whom they chase (the scripted `kite` needs 129 steps
+on 3s_vs_5z instead of 146 with two and 173 with four); four cost 1.4 times as much as two.
 
 The files: skirmish_layout.py says where everything is in observations, state and actions;
 skirmish_config.py what a map and a unit type may say; skirmish_tables.py holds both as arrays;
