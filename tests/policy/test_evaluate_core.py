@@ -20,7 +20,7 @@ from policy_pkg.train.evaluate import (
     evaluate,
     exactly,
     named,
-    record_episode,
+    record,
 )
 from policy_pkg.train.learner import Learner
 from policy_pkg.train.learner_config import LearnerConfig
@@ -85,7 +85,10 @@ def test_who_crashes_is_what_the_condition_says(policy: RecurrentPolicy) -> None
 def test_a_recorded_episode_is_the_evaluated_one(policy: RecurrentPolicy) -> None:
     condition = named(["robot_2"])
     evaluated = evaluate(policy, SCENARIO, condition, 3, 7).episodes[2]
-    frames = record_episode(policy, SCENARIO, condition, 2, 7)
+    (frames,) = record(policy, SCENARIO, condition, range(2, 3), 7)
+    many = record(policy, SCENARIO, condition, range(5), 7, n_arenas=2)
+    assert [f.episode for f in many] == list(range(5))
+    assert many[2].trajectory_hash == frames.trajectory_hash
     assert frames.trajectory_hash == evaluated.trajectory_hash
     assert (frames.episode, frames.steps) == (2, evaluated.steps)
     assert frames.returns[-1] == evaluated.episode_return

@@ -142,22 +142,27 @@ def evaluate_in(
     return _Run(env, RecurrentTeam(policy, env), condition, seed).evaluation(episodes)
 
 
-def record_episode(
+def record(
     target: PolicyBundle | RecurrentPolicy | Scripted,
     scenario: str | Path,
     condition: Condition,
-    episode: int,
+    episodes: range,
     seed: int,
-) -> Frames:
-    """Plays one episode as ``evaluate`` does, and keeps what can be drawn of it.
+    n_arenas: int = 32,
+) -> list[Frames]:
+    """Plays episodes as ``evaluate`` does, and keeps what can be drawn of each; in their order.
 
     Raises:
         As ``evaluate``.
     """
-    env = make_env(scenario, 1)
-    run = _Run(env, _team(target, env), condition, seed, lambda k: Recorder(env, 0, seed, k))
-    (result,) = run.evaluation(range(episode, episode + 1)).episodes
-    return run.recorders[0].finish(result.success, result.trajectory_hash)
+    env = make_env(scenario, max(1, min(n_arenas, len(episodes))))
+
+    def recorder(arena: int, episode: int) -> Recorder:
+        return Recorder(env, arena, seed, episode)
+
+    run = _Run(env, _team(target, env), condition, seed, recorder)
+    run.evaluation(episodes)
+    return sorted(run.frames, key=lambda frames: frames.episode)
 
 
 def _team(target: PolicyBundle | RecurrentPolicy | Scripted, env: Env) -> Team:
@@ -178,7 +183,7 @@ class _Run:
         team: Team,
         condition: Condition,
         seed: int,
-        recorder: Callable[[int], Recorder] | None = None,
+        recorder: Callable[[int, int], Recorder] | None = None,
     ) -> None:
         try:
             coach = Coach(condition.crash, env.spec.robots, seed)
@@ -192,7 +197,8 @@ class _Run:
         self._hashes: dict[int, TrajectoryHash] = {}
         self._returns = np.zeros(env.n_arenas, dtype=np.float64)
         self._recorder = recorder
-        self.recorders: dict[int, Recorder] = {}  # by arena, where a recorder was given
+        self._recorders: dict[int, Recorder] = {}  # by arena, where a recorder was given
+        self.frames: list[Frames] = []  # of the episodes that have ended
 
     def evaluation(self, episodes: range) -> Evaluation:
         """Plays and sums up."""
@@ -219,7 +225,7 @@ class _Run:
         for arena, episode in zip(arenas.tolist(), episodes, strict=True):
             self._hashes[arena] = TrajectoryHash(self._seed, episode)
             if self._recorder is not None:
-                self.recorders[arena] = self._recorder(episode)
+                self._recorders[arena] = self._recorder(arena, episode)
 
     def _observe(self) -> None:
         obs, state = self._env.obs, self._env.state
@@ -238,18 +244,21 @@ class _Run:
                 bool(result.truncated[arena]),
                 bool(result.success[arena]),
             )
-            if arena in self.recorders:
-                self.recorders[arena].step(done.modes[arena] != 0, reward)
+            if arena in self._recorders:
+                self._recorders[arena].step(done.modes[arena] != 0, reward)
 
     def _result(self, arena: int, done: Executed) -> EpisodeResult:
-        plan = self._arenas.plans[arena]
+        success = bool(done.result.success[arena])
+        trajectory_hash = self._hashes[arena].hexdigest()
+        if arena in self._recorders:
+            self.frames.append(self._recorders.pop(arena).finish(success, trajectory_hash))
         return EpisodeResult(
             episode=int(self._arenas.episodes[arena]),
-            success=bool(done.result.success[arena]),
+            success=success,
             episode_return=float(self._returns[arena]),
             steps=int(self._arenas.steps[arena]),
-            crashed=_faulted(plan),
-            trajectory_hash=self._hashes[arena].hexdigest(),
+            crashed=_faulted(self._arenas.plans[arena]),
+            trajectory_hash=trajectory_hash,
         )
 
 

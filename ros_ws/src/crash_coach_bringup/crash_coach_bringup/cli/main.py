@@ -7,11 +7,21 @@ import sys
 
 import typer
 
-from crash_coach_bringup.cli import demo, doctor, evaluate, inject, plot, render, train, up
+from crash_coach_bringup.cli import (
+    calibrate,
+    demo,
+    doctor,
+    evaluate,
+    inject,
+    plot,
+    render,
+    train,
+    up,
+)
 from sim_pkg.contract import UserError
 
 # Options that take several values, up to the next option: --crashed 0 1 2
-SEVERAL = {"--crash-rate", "--crashed", "--victims", "--set", "--seed"}
+SEVERAL = {"--crash-rate", "--crashed", "--victims", "--set", "--seed", "--policy"}
 
 app = typer.Typer(
     name="crash-coach",
@@ -29,6 +39,7 @@ app.command("inject")(inject.inject)
 app.command("demo")(demo.demo)
 app.command("plot")(plot.plot)
 app.command("render")(render.render)
+app.command("calibrate")(calibrate.calibrate)
 
 
 def repeat_options(arguments: list[str]) -> list[str]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from policy_pkg.checkpoint import PolicyBundle
-from policy_pkg.train.evaluate import Condition, Evaluation, record_episode
+from policy_pkg.train.evaluate import Condition, Evaluation, record
 from sim_pkg.render import Panel, Track, draw_trajectories
 
 
@@ -35,9 +35,8 @@ def draw_first_episodes(teams: Sequence[TeamResults], scenario: str, path: Path)
         for team in teams:
             condition, evaluation = team.results[index]
             first = evaluation.episodes[0]
-            frames = record_episode(
-                team.bundle, scenario, condition, first.episode, evaluation.seed
-            )
+            one = range(first.episode, first.episode + 1)
+            (frames,) = record(team.bundle, scenario, condition, one, evaluation.seed)
             if frames.trajectory_hash != first.trajectory_hash:
                 raise RuntimeError(
                     f"{team.label}, {condition.name}: episode {first.episode} has trajectory "

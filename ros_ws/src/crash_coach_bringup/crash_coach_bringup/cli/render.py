@@ -10,7 +10,7 @@ import typer
 from crash_coach_bringup.cli.evaluate import CrashMode, conditions
 from crash_coach_bringup.cli.output import CliError, check_json_target, console, write_json
 from crash_coach_bringup.cli.target import HELP, load_target
-from policy_pkg.train.evaluate import Condition, record_episode
+from policy_pkg.train.evaluate import Condition, record
 from sim_pkg.frames import Frames
 
 FILMS, STILLS = (".mp4", ".gif"), (".png",)
@@ -93,7 +93,7 @@ def render(
     asked = conditions(target.robots, rates, counts, victims or [], mode)
     if len(asked) > 1:
         raise CliError("--crash-rate, --crashed, --victims: an episode is played under one of them")
-    frames = record_episode(target.team, target.scenario, asked[0], episode, seed)
+    (frames,) = record(target.team, target.scenario, asked[0], range(episode, episode + 1), seed)
     draw(frames, out, speed)
     who = ", ".join(target.robots[i] for i in frames.faulted) or "nobody"
     done = "success" if frames.success else "no success"

@@ -1,0 +1,115 @@
+"""`crash-coach calibrate`: what the scripted policies achieve, beside each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from crash_coach_bringup.cli.evaluate import CrashMode, conditions
+from crash_coach_bringup.cli.output import (
+    CliError,
+    check_json_target,
+    console,
+    percent_ci,
+    table,
+    write_json,
+)
+from policy_pkg.train.evaluate import Condition, Scripted, record
+from policy_pkg.train.statistics import wilson
+from sim_pkg.env import make_env
+from sim_pkg.frames import Frames, Side
+from sim_pkg.scripted import make_scripted, scripted_names
+
+
+def figures(episodes: Sequence[Frames]) -> dict[str, Any]:
+    """JSON values: win rate with its Wilson interval, mean length, who was lost on average."""
+    wins = sum(frames.success for frames in episodes)
+    interval = wilson(wins, len(episodes))
+
+    def lost(side: Side) -> float:
+        return float(np.mean([(~f.alive[-1, f.indexes(side)]).sum() for f in episodes]))
+
+    return {
+        "success_rate": wins / len(episodes),
+        "success_ci95": [interval.low, interval.high],
+        "steps_mean": float(np.mean([frames.steps for frames in episodes])),
+        "robots_lost_mean": lost(Side.ROBOTS),
+        "opponents_lost_mean": lost(Side.OPPONENTS),
+        "return_mean": float(np.mean([frames.returns[-1] for frames in episodes])),
+    }
+
+
+def rows_of(
+    scenario: str,
+    policies: list[str],
+    crashed: list[int],
+    mode: CrashMode,
+    episodes: int,
+    seed: int,
+) -> list[dict[str, Any]]:
+    """A row per policy and number of crashed robots."""
+    env = make_env(scenario, 1)
+    names = policies or list(scripted_names(env))
+    for name in names:
+        make_scripted(name, env)  # refuses those that do not play it, before any is played
+    asked: list[tuple[str, Condition]] = [
+        (name, condition)
+        for name in names
+        for condition in conditions(env.spec.robots, [], crashed, [], mode)
+    ]
+    return [
+        {
+            "scenario": scenario,
+            "policy": name,
+            "condition": condition.name,
+            **figures(record(Scripted(name), scenario, condition, range(episodes), seed)),
+        }
+        for name, condition in asked
+    ]
+
+
+def show(rows: Sequence[dict[str, Any]], title: str) -> None:
+    columns = ["scenario", "policy", "crash", "success (95 % interval)", "steps"]
+    out = table(title, [*columns, "robots lost", "opponents lost", "return"])
+    for row in rows:
+        out.add_row(
+            row["scenario"],
+            row["policy"],
+            row["condition"],
+            percent_ci(row["success_rate"], row["success_ci95"]),
+            f"{row['steps_mean']:.0f}",
+            f"{row['robots_lost_mean']:.1f}",
+            f"{row['opponents_lost_mean']:.1f}",
+            f"{row['return_mean']:.1f}",
+        )
+    console.print(out)
+
+
+def calibrate(
+    scenarios: Annotated[
+        list[str] | None, typer.Argument(metavar="SCENARIO", help="Scenario names or YAML files.")
+    ] = None,
+    policy: Annotated[
+        list[str] | None, typer.Option(help="NAME ...: these; default: all that play it.")
+    ] = None,
+    crashed: Annotated[
+        list[int] | None, typer.Option(help="K ...: exactly K robots, drawn anew each episode.")
+    ] = None,
+    mode: Annotated[CrashMode, typer.Option(help="What a crashed robot does.")] = CrashMode.stay,
+    episodes: Annotated[int, typer.Option(help="Episodes of each.", min=1)] = 256,
+    seed: Annotated[int, typer.Option(help="Seed of episodes and victims.", min=0)] = 0,
+    json: Annotated[Path | None, typer.Option(help="Also write the figures to this file.")] = None,
+) -> None:
+    """Plays scripted policies: is a scenario as hard as it should be, and winnable at all?"""
+    check_json_target(json)
+    if not scenarios:
+        raise CliError("no scenario: name at least one, such as skirmish/3s_vs_5z")
+    rows: list[dict[str, Any]] = []
+    for scenario in scenarios:
+        rows += rows_of(scenario, policy or [], crashed or [], mode, episodes, seed)
+    show(rows, f"{episodes} episodes each, seed {seed}")
+    write_json(json, {"seed": seed, "episodes": episodes, "mode": mode.value, "rows": rows})
