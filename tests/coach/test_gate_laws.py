@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
@@ -89,7 +89,7 @@ class Run:
         command = decision.command
         key = (*command.key, command.robot)
         if decision.repeated:
-            assert decision == replace(self.decided[key], repeated=True)
+            assert decision == self.decided[key]._replace(repeated=True)
             return
         assert key not in self.decided, "decided twice"
         assert key in self.asked

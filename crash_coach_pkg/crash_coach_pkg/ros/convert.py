@@ -74,13 +74,14 @@ def plan_from_message(message: CrashPlanMessage, robots: tuple[str, ...]) -> Cra
 
 
 def command_from_bytes(robot: int, data: bytes) -> Command:
-    """A serialized Action, which is the token: untouched, it goes out as it came in.
+    """A serialized Action, which is the token (and where its fields start).
 
     Raises:
         UserError: not little-endian CDR, or cut short.
     """
-    episode, step, action, _ = _COMMANDED.unpack_from(data, _body(data))
-    return Command(robot, episode, step, action, data)
+    start = _body(data)
+    episode, step, action, _ = _COMMANDED.unpack_from(data, start)
+    return Command(robot, episode, step, action, (data, start))
 
 
 def _body(data: bytes) -> int:
@@ -99,8 +100,8 @@ def _body(data: bytes) -> int:
 
 def bytes_from_decision(decision: Decision) -> bytes:
     """What goes out on /<robot>/command: the bytes that came in, where nothing was replaced."""
-    data: bytes = decision.command.token
-    start = _body(data)
+    data: bytes
+    data, start = decision.command.token
     if decision.mode == Mode.NONE and data[start + _FAULT_AT] == Mode.NONE:
         return data
     command = decision.command
@@ -112,7 +113,7 @@ def bytes_from_decision(decision: Decision) -> bytes:
 def effect_from_decision(decision: Decision, robots: tuple[str, ...]) -> FaultEvent:
     command = decision.command
     return FaultEvent(
-        header=deserialize_message(command.token, Action).header,
+        header=deserialize_message(command.token[0], Action).header,
         kind=FaultEvent.EFFECT,
         episode=command.episode,
         step=command.step,
