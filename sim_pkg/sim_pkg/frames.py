@@ -16,7 +16,6 @@ from sim_pkg.scenarios.skirmish_layout import STATE_HEALTH, STATE_OPPONENT_HEALT
 
 # Columns of the shield in a robot's and an opponent's part of a skirmish's state.
 _STATE_SHIELD, _STATE_OPPONENT_SHIELD = 4, 3
-_HURT = 1e-4  # share of a full health from which a loss is one, and not rounding
 
 
 class Side(IntEnum):
@@ -56,6 +55,7 @@ class Frames:
     angles_rad: FloatArray  # (T+1, d)
     health: FloatArray  # (T+1, d) share of the full health, 0: dead; 1 without such a thing
     shield: FloatArray  # (T+1, d) share of the full shield
+    damage: FloatArray  # (T, d, d) what i took from j in a step
     sites_done: BoolArray  # (T+1, m)
     crashed: BoolArray  # (T, n) robots whose command a fault replaced
     returns: npt.NDArray[np.float64]  # (T+1,) sum of the rewards so far
@@ -78,9 +78,8 @@ class Frames:
 
     @property
     def hits(self) -> BoolArray:
-        """(T, d) which actors lost health or shield in a step."""
-        lost = -np.minimum(np.diff(self.health, axis=0), np.diff(self.shield, axis=0))
-        hits: BoolArray = lost > _HURT
+        """(T, d) which actors were hit in a step."""
+        hits: BoolArray = np.any(self.damage > 0, axis=1)
         return hits
 
     @property
@@ -102,6 +101,7 @@ class Recorder:
         self._bodies: list[tuple[FloatArray, FloatArray]] = []
         self._vitals: list[tuple[FloatArray, FloatArray]] = []
         self._sites_done: list[BoolArray] = []
+        self._damage: list[FloatArray] = []
         self._crashed: list[BoolArray] = []
         self._returns = [0.0]
         self._look()
@@ -109,6 +109,7 @@ class Recorder:
     def step(self, crashed: BoolArray, reward: float) -> None:
         """After a control step. crashed: (n,) whose command a fault replaced in it."""
         self._crashed.append(crashed.copy())
+        self._damage.append(self._env.hits[self._arena].copy())
         self._returns.append(self._returns[-1] + reward)
         self._look()
 
@@ -131,12 +132,19 @@ class Recorder:
             angles_rad=np.stack([angles for _, angles in self._bodies]),
             health=np.stack([health for health, _ in self._vitals]),
             shield=np.stack([shield for _, shield in self._vitals]),
+            damage=self._all_damage(),
             sites_done=np.stack(self._sites_done),
             crashed=np.stack(self._crashed),
             returns=np.array(self._returns),
             success=success,
             trajectory_hash=trajectory_hash,
         )
+
+    def _all_damage(self) -> FloatArray:
+        """(T, d, d); only discs take and do damage, and they come first."""
+        among_discs = np.stack(self._damage)
+        more = self._env.world.bodies.shape[1] - among_discs.shape[1]
+        return np.pad(among_discs, ((0, 0), (0, more), (0, more)))
 
     def _look(self) -> None:
         env, arena = self._env, self._arena

@@ -84,12 +84,12 @@ class Stage:
             (MARGIN_IN / WIDTH_IN, FOOTER_IN / height, inner / WIDTH_IN, tall / height)
         )
         self.pixels_per_m = inner * DPI / (x2 - x1)
-        self._draw_arena(frames)
         top = 1 - 0.5 * HEADER_IN / height
         style: dict[str, Any] = {"va": "center", "fontsize": FONT_PT, "color": INK}
         side = MARGIN_IN / WIDTH_IN
-        self.title = self.figure.text(side, top, title(frames), ha="left", **style)
+        self.title = self.figure.text(side, top, "", ha="left", **style)
         self.clock = self.figure.text(1 - side, top, "", ha="right", **style)
+        self._draw_arena(frames)
         self.figure.legend(
             handles=list(legend), loc="lower center", ncols=len(legend), frameon=False,
             fontsize=FONT_PT - 1, bbox_to_anchor=(0.5, 0.0), borderaxespad=0.3,
@@ -117,6 +117,7 @@ class Stage:
         ax.add_patch(floor)
         ax.add_patch(wall)
         every = frames.scene.cell_m or grid_step(x2 - x1)
+        self.title.set_text(f"{title(frames)}, grid {every:g} m")
         for x in np.arange(math.ceil(x1 / every), x2 / every + 1e-6) * every:
             ax.plot((x, x), (low, high), color=GRID, linewidth=0.7, zorder=1)
         for y in np.arange(math.ceil(y1 / every), y2 / every + 1e-6) * every:

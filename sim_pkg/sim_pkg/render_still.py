@@ -103,7 +103,11 @@ def _draw_ends(stage: Stage, frames: Frames, index: int, way: FloatArray) -> Non
         fontsize=size, color=INK, zorder=9,
     )  # fmt: skip
     if len(way) <= frames.steps:
-        ax.plot(*way[-1], marker="x", markersize=8, markeredgewidth=2.4, color=colour, zorder=10)
+        # Beside the number of a robot that died where it started.
+        at = np.array(way[-1])
+        if np.linalg.norm(at - way[0]) < actor.radius_m:
+            at += actor.radius_m
+        ax.plot(*at, marker="x", markersize=8, markeredgewidth=2.4, color=colour, zorder=10)
     elif np.linalg.norm(way[-1] - way[0]) > 0.2 * actor.radius_m:
         ax.add_patch(Circle(tuple(way[-1]), actor.radius_m, facecolor=colour, zorder=8))
         label = ax.text(

@@ -126,6 +126,7 @@ class _Film:
         for patch in self._sites:
             ax.add_patch(patch)
         self._trails: Any = ax.add_collection(LineCollection([], linewidths=1.6, zorder=4))
+        self._shots: Any = ax.add_collection(LineCollection([], linewidths=1.6, zorder=6.5))
         self._crates: Any = ax.add_collection(PolyCollection([], edgecolors=INK, zorder=5))
         self._flashes = self._circles(1.35, facecolors=HIT, zorder=6)
         self._bodies = self._circles(1.0, linewidths=1.4, zorder=7)
@@ -142,8 +143,8 @@ class _Film:
             for i, radius in zip(self._discs, self._radii, strict=True)
         ]  # fmt: skip
         self._moving = [
-            *self._sites, self._trails, self._crates, self._dead, self._flashes, self._bodies,
-            self._arcs, *self._labels, stage.clock,
+            *self._sites, self._trails, self._crates, self._dead, self._flashes, self._shots,
+            self._bodies, self._arcs, *self._labels, stage.clock,
         ]  # fmt: skip
         for artist in self._moving:
             artist.set_animated(True)
@@ -202,6 +203,9 @@ class _Film:
         step = min(shown, frames.steps - 1)
         hit = frames.hits[step, discs] & alive & (shown == step)
         self._flashes.set_offsets(_where(hit, places))
+        pairs = np.argwhere((frames.damage[step] > 0) & (shown == step))
+        self._shots.set_segments([now[pair] for pair in pairs])
+        self._shots.set_color([SIDE_COLOURS[frames.actors[i].side] for i, _ in pairs])
         colours, edges = [], []
         styles: list[Any] = []
         for i in discs:

@@ -37,6 +37,7 @@ def frames(path_m: np.ndarray = PATH_M, crashed: tuple[int, ...] = ()) -> Frames
         actors=tuple(Actor(f"robot_{i + 1}", "robot", Side.ROBOTS, 0.4) for i in range(n)),
         positions_m=path_m.astype(np.float32), angles_rad=np.zeros((steps + 1, n), np.float32),
         health=np.ones((steps + 1, n), np.float32), shield=np.zeros((steps + 1, n), np.float32),
+        damage=np.zeros((steps, n, n), np.float32),
         sites_done=np.zeros((steps + 1, 2), np.bool_), crashed=faults,
         returns=np.arange(steps + 1, dtype=np.float64), success=True, trajectory_hash="ab",
     )  # fmt: skip
@@ -49,8 +50,11 @@ def fight() -> Frames:
         Actor("robot_1", "marine", Side.ROBOTS, 0.4),
         Actor("opponent_1", "zealot", Side.OPPONENTS, 0.5),
     )
+    damage = np.zeros((2, 2, 2), np.float32)
+    damage[0, 1, 0], damage[1, 0, 1] = 20.0, 200.0
     return replace(
         frames(path_m),
+        damage=damage,
         scene=Scene((32.0, 32.0), 0.0, (0.4,), ()),
         walled_m=(0.0, 7.0, 32.0, 24.0),
         actors=actors,

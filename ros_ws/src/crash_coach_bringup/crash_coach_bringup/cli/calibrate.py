@@ -72,12 +72,11 @@ def rows_of(
     ]
 
 
-def show(rows: Sequence[dict[str, Any]], title: str) -> None:
-    columns = ["scenario", "policy", "crash", "success (95 % interval)", "steps"]
-    out = table(title, [*columns, "robots lost", "opponents lost", "return"])
+def show(title: str, rows: Sequence[dict[str, Any]]) -> None:
+    columns = ["policy", "crash", "success (95 %)", "steps", "robots lost", "opp. lost", "return"]
+    out = table(title, columns)
     for row in rows:
         out.add_row(
-            row["scenario"],
             row["policy"],
             row["condition"],
             percent_ci(row["success_rate"], row["success_ci95"]),
@@ -110,6 +109,7 @@ def calibrate(
         raise CliError("no scenario: name at least one, such as skirmish/3s_vs_5z")
     rows: list[dict[str, Any]] = []
     for scenario in scenarios:
-        rows += rows_of(scenario, policy or [], crashed or [], mode, episodes, seed)
-    show(rows, f"{episodes} episodes each, seed {seed}")
+        here = rows_of(scenario, policy or [], crashed or [], mode, episodes, seed)
+        show(f"{scenario}: {episodes} episodes each, seed {seed}", here)
+        rows += here
     write_json(json, {"seed": seed, "episodes": episodes, "mode": mode.value, "rows": rows})

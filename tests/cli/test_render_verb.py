@@ -1,0 +1,85 @@
+"""`crash-coach render`, and evaluate of scripted teams: the command as it is installed."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from crash_coach_bringup.ros.probe import find_executable
+from policy_pkg.train.evaluate import Scripted, evaluate, named
+from policy_pkg.untrained import write_untrained
+from sim_pkg.env import make_env
+
+RANDOM = ("scripted:random", "--scenario", "buttons")
+
+
+def crash_coach(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [str(find_executable("crash_coach_bringup", "crash-coach")), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=90)
+
+
+def render(*arguments: str) -> str:
+    done = crash_coach("render", *arguments)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def refused(*arguments: str) -> str:
+    """The one line with which the command refuses."""
+    done = crash_coach(*arguments)
+    assert done.returncode in (1, 2), done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stderr
+
+
+def test_it_draws_the_episode_that_evaluate_plays(tmp_path: Path) -> None:
+    out, report = tmp_path / "film.gif", tmp_path / "film.json"
+    text = render(
+        *RANDOM, "--seed", "4", "--episode", "2", "--victims", "robot_2", "--speed", "20",
+        "--out", str(out), "--json", str(report),
+    )  # fmt: skip
+    assert "crashed: robot_2" in text
+    assert out.read_bytes().startswith(b"GIF8")
+    told = json.loads(report.read_text())
+    played = evaluate(Scripted("random"), "buttons", named(["robot_2"], "stay"), 3, 4).episodes[2]
+    assert told["trajectory_hash"] == played.trajectory_hash
+    assert (told["steps"], told["crashed"]) == (played.steps, [1])
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["film.gif", "film.json"]
+
+
+def test_it_draws_a_trained_team_on_its_own_scenario(tmp_path: Path) -> None:
+    run = tmp_path / "step_000000000"
+    write_untrained(run, make_env("buttons", 1).spec, seed=1)
+    render(str(run), "--out", str(tmp_path / "still.png"))
+    assert (tmp_path / "still.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "names"),
+    [
+        (("--out", "x.avi"), "x.avi: a file ending in .mp4, .gif, .png"),
+        (("--out", "/no/where/x.png"), "no folder /no/where"),
+        (("--out", "x.png", "--speed", "0"), "--speed 0.0"),
+        (("--out", "x.png", "--crashed", "9"), "--crashed 9: the team has 2 robots"),
+        (("--out", "x.png", "--crashed", "1", "--victims", "robot_1"), "under one of them"),
+    ],
+)
+def test_bad_input_names_the_thing(
+    arguments: tuple[str, ...], names: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert names in refused("render", *RANDOM, *arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_wrong_scripted_team_is_named() -> None:
+    assert "--scenario is needed" in refused("evaluate", "scripted:random")
+    text = refused("evaluate", "scripted:nearst", "--scenario", "skirmish/3m")
+    assert "unknown scripted policy 'nearst' (did you mean 'nearest'?)" in text
+    assert "does not play scenario 'buttons'" in refused(
+        "evaluate", "scripted:nearest", "--scenario", "buttons"
+    )
+    assert "--via ros" in refused("evaluate", *RANDOM, "--via", "ros")
