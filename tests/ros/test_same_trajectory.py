@@ -66,7 +66,7 @@ def test_core_and_ros_give_the_same_bits(checkpoint: Path, layout: Layout, condi
     compare(checkpoint, CONDITIONS[condition], layout, episodes=4)
 
 
-@pytest.mark.parametrize("scenario", ["coverage", "transport"])
+@pytest.mark.parametrize("scenario", ["coverage", "transport", "skirmish/3s_vs_3z", "skirmish/8m"])
 def test_every_kind_of_scenario(tmp_path: Path, scenario: str) -> None:
     checkpoint = untrained(tmp_path, scenario)
     compare(checkpoint, CONDITIONS["rate"], "single", episodes=2, scenario=scenario)
