@@ -23,13 +23,11 @@ from rcl_interfaces.msg import (
 )
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
-from rclpy.exceptions import ParameterUninitializedException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from crash_coach_pkg.config import check_robots
 from crash_coach_pkg.control import Control
 from crash_coach_pkg.parameters import (
     ParameterSpec,
@@ -47,6 +45,7 @@ from crash_coach_pkg.ros.run import (
     SPIN_S,
     TICK_S,
     refuse_unknown_parameters,
+    robot_names,
     spin,
 )
 from sim_pkg.contract import UserError
@@ -130,7 +129,7 @@ class CoachNode(Node):
 
     def __init__(self, context: Context | None = None) -> None:
         super().__init__("coach", context=context)
-        self._robots = self._robot_names()
+        self._robots = robot_names(self)
         self._values: dict[str, Value] = {}
         self._unconfirmed = ""  # why no gate confirmed the last change that was made all the same
         for spec in parameter_specs():
@@ -148,20 +147,6 @@ class CoachNode(Node):
         self._served: Future[None] | None = None
         self.add_on_set_parameters_callback(self._on_set)
         self.create_service(Trigger, "/coach/clear_all", self._on_clear_all)
-
-    def _robot_names(self) -> tuple[str, ...]:
-        description = "Names (namespaces) of the team's robots, in order."
-        try:
-            names = self.declare_parameter(
-                "robots",
-                Parameter.Type.STRING_ARRAY,
-                ParameterDescriptor(description=description, read_only=True),
-            ).value
-        except ParameterUninitializedException:
-            names = None
-        if names is None:
-            raise UserError("parameter 'robots' of coach is missing: the robots' names, in order")
-        return check_robots(names)
 
     def start(self) -> None:
         """Serves parameters and services in a thread."""

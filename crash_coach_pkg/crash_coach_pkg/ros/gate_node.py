@@ -11,12 +11,9 @@ from crash_coach_interfaces.msg import Action, CrashPlan, FaultEvent, Observatio
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
-from rclpy.exceptions import ParameterUninitializedException
 from rclpy.executors import Executor
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 
-from crash_coach_pkg.config import check_robots
 from crash_coach_pkg.gate_state import NOTHING_APPLIED, Decision, EventKind, GateState, Outputs
 from crash_coach_pkg.plan import Mode
 from crash_coach_pkg.ros.convert import (
@@ -26,7 +23,15 @@ from crash_coach_pkg.ros.convert import (
     message_from_event,
     plan_from_message,
 )
-from crash_coach_pkg.ros.run import EVENTS, NEWEST, PLAN, TICK_S, refuse_unknown_parameters, spin
+from crash_coach_pkg.ros.run import (
+    EVENTS,
+    NEWEST,
+    PLAN,
+    TICK_S,
+    refuse_unknown_parameters,
+    robot_names,
+    spin,
+)
 from sim_pkg.contract import UserError
 
 LOCKSTEP = ParameterDescriptor(
@@ -51,7 +56,7 @@ class GateNode(Node):
 
     def __init__(self, context: Context | None = None) -> None:
         super().__init__("gate", context=context)
-        self._robots = self._robot_names()
+        self._robots = robot_names(self)
         lockstep: bool = self.declare_parameter("lockstep", True, LOCKSTEP).value
         first_lease_s: float = self.declare_parameter("first_lease_s", 10.0, FIRST_LEASE).value
         refuse_unknown_parameters(self)
@@ -71,20 +76,6 @@ class GateNode(Node):
             )
         self.create_subscription(CrashPlan, "/coach/plan", self._on_plan, PLAN)
         self.create_timer(TICK_S, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-    def _robot_names(self) -> tuple[str, ...]:
-        description = "Names (namespaces) of the robots whose commands pass through, in order."
-        try:
-            names = self.declare_parameter(
-                "robots",
-                Parameter.Type.STRING_ARRAY,
-                ParameterDescriptor(description=description, read_only=True),
-            ).value
-        except ParameterUninitializedException:
-            names = None
-        if names is None:
-            raise UserError("parameter 'robots' of gate is missing: the robots' names, in order")
-        return check_robots(names)
 
     def _on_command(self, robot: int, data: bytes) -> None:
         try:

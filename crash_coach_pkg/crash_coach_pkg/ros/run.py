@@ -10,14 +10,17 @@ from pathlib import Path
 from types import FrameType
 
 import rclpy
-from rclpy.exceptions import ParameterException
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.exceptions import ParameterException, ParameterUninitializedException
 from rclpy.executors import Executor
 from rclpy.experimental import EventsExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
+from crash_coach_pkg.config import check_robots
 from sim_pkg.contract import UserError
 
 NEWEST = QoSProfile(depth=1)  # reliable: an observation or command replaces the one before
@@ -27,6 +30,25 @@ EPISODE = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 SPIN_S = 0.1  # how soon a signal is noticed
 TICK_S = 0.05  # steady timers for leases and heartbeats
 RCLError: type[Exception] = rclpy_implementation.RCLError  # bad --ros-args, for one
+
+
+def robot_names(node: Node) -> tuple[str, ...]:
+    """The parameter ``robots``: the team's namespaces, in order; read-only.
+
+    Raises:
+        UserError: it is missing or wrong.
+    """
+    descriptor = ParameterDescriptor(
+        description="Names (namespaces) of the team's robots, in order.", read_only=True
+    )
+    try:
+        names = node.declare_parameter("robots", Parameter.Type.STRING_ARRAY, descriptor).value
+    except ParameterUninitializedException:
+        names = None
+    if names is None:
+        name = node.get_name()
+        raise UserError(f"parameter 'robots' of {name} is missing: the robots' names, in order")
+    return check_robots(names)
 
 
 def refuse_unknown_parameters(node: Node) -> None:
