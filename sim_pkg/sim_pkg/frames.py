@@ -171,8 +171,8 @@ def actors(env: Env) -> tuple[Actor, ...]:
         for name, radius in zip(names, env.scene.radii_m, strict=True)
     )
     boxes = tuple(
-        Actor(f"box_{k + 1}", "box", Side.THINGS, 0.0, (box.width_m, box.height_m))
-        for k, box in enumerate(env.world.spec.boxes)
+        Actor(f"box_{k + 1}", "box", Side.THINGS, 0.0, size_m)
+        for k, size_m in enumerate(env.scene.boxes_m)
     )
     return robots + boxes
 

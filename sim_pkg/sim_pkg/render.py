@@ -80,7 +80,7 @@ def _draw_panel(ax: Any, panel: Panel) -> None:
     ax.set_ylim(-0.03 * height, 1.03 * height)
     ax.set_aspect("equal")
     ax.axis("off")
-    for patch in sites(frames):
+    for patch in sites(scene):
         ax.add_patch(patch)
     if scene.cell_m > 0:
         for x in np.arange(0.0, width + cell / 2, cell):
@@ -137,7 +137,8 @@ def _legend(panels: Sequence[Panel]) -> list[Any]:
     if any(track.frames.faulted for track in tracks):
         handles.append(_ring((0, 0), 1.0, crashed=True, label="crashed robot"))
     if any(track.frames.scene.sites_m for track in tracks):
-        handles.append(Rectangle((0, 0), 1, 1, facecolor=SITES[0], label="site"))
+        name = tracks[0].frames.scene.site_name
+        handles.append(Rectangle((0, 0), 1, 1, facecolor=SITES[0], label=name))
     return handles
 
 

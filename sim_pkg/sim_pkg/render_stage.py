@@ -18,11 +18,13 @@ from matplotlib.patches import Circle, Patch, Rectangle
 from matplotlib.transforms import Affine2D
 
 from sim_pkg.frames import Actor, Frames, Side
+from sim_pkg.scenarios.base import Scene
 
 INK = "#333333"
 GRID = "#dddddd"
 PAPER = "#ffffff"
 OUTSIDE = "#ececec"
+ROUGH = "#f3f0ea"
 SITES = ("#f4c95d", "#8ecae6", "#cdb4db", "#b7e4c7")
 SITE_DONE = "#c9c9c9"
 # Okabe and Ito's palette: told apart with every kind of colour vision.
@@ -115,6 +117,11 @@ class Stage:
             zorder=3,
         )
         ax.add_patch(floor)
+        for x, y, right_m, top_m in frames.scene.rough_m:
+            size = (right_m - x, top_m - y)
+            ax.add_patch(
+                Rectangle((x, y), *size, facecolor=ROUGH, edgecolor=GRID, hatch="....", zorder=0)
+            )
         ax.add_patch(wall)
         every = frames.scene.cell_m or grid_step(x2 - x1)
         self.title.set_text(f"{title(frames)}, grid {every:g} m")
@@ -163,16 +170,40 @@ def box_corners(
     return corners
 
 
-def sites(frames: Frames) -> list[Patch]:
-    """A patch per site: cells on a grid, discs elsewhere."""
-    cell = frames.scene.cell_m
+def site_colour(scene: Scene, index: int) -> str:
+    """On a grid, the sites are told apart, as in the paper's figure."""
+    return SITES[index % len(SITES)] if scene.site_radius_m == 0 else SITES[0]
+
+
+def sites(scene: Scene) -> list[Patch]:
+    """A patch per site: cells of a grid, or discs."""
+    cell, radius = scene.cell_m or 1.0, scene.site_radius_m
     out: list[Patch] = []
-    for i, (x, y) in enumerate(frames.scene.sites_m):
-        style: dict[str, Any] = {"facecolor": SITES[i % len(SITES)], "zorder": 2}
-        if cell > 0:
-            out.append(Rectangle((x - cell / 2, y - cell / 2), cell, cell, **style))
+    for i, (x, y) in enumerate(scene.sites_m):
+        style: dict[str, Any] = {"facecolor": site_colour(scene, i), "zorder": 2}
+        if radius > 0:
+            out.append(Circle((x, y), radius, **style))
         else:
-            out.append(Circle((x, y), 0.5, **style))
+            out.append(Rectangle((x - cell / 2, y - cell / 2), cell, cell, **style))
+    return out
+
+
+def site_entry(scene: Scene, done: bool = False) -> Line2D:
+    """The legend's entry for a site."""
+    name = f"{scene.site_name}, done" if done else scene.site_name
+    marker = "o" if scene.site_radius_m > 0 else "s"
+    return entry(name, marker=marker, color=SITE_DONE if done else SITES[0])
+
+
+def scene_entries(frames: Frames) -> list[Any]:
+    """The legend's entries for what a scenario has but robots."""
+    out: list[Any] = []
+    if frames.indexes(Side.THINGS):
+        out.append(entry("box", marker="s", color=SIDE_COLOURS[Side.THINGS]))
+    if frames.scene.rough_m:
+        out.append(Patch(facecolor=ROUGH, edgecolor=CRASHED, hatch="....", label="rough floor"))
+    if frames.scene.sites_m:
+        out.append(site_entry(frames.scene))
     return out
 
 

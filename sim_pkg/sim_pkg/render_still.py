@@ -16,12 +16,12 @@ from sim_pkg.render_stage import (
     CRASHED,
     INK,
     SIDE_COLOURS,
-    SITES,
     Stage,
     box_corners,
     entry,
     letter,
     outcome,
+    scene_entries,
     sites,
     whole_file,
 )
@@ -39,7 +39,7 @@ def draw_still(frames: Frames, path: Path) -> None:
     """
     stage = Stage(frames, _legend(frames))
     stage.clock.set_text(outcome(frames))
-    for patch in sites(frames):
+    for patch in sites(frames.scene):
         stage.ax.add_patch(patch)
     for index in reversed(range(len(frames.actors))):
         _draw_way(stage, frames, index)
@@ -134,8 +134,4 @@ def _legend(frames: Frames) -> list[Any]:
         out.append(entry("was hit", **ring))
     if not frames.alive[-1].all():
         out.append(entry("died", marker="x", markersize=8, markeredgewidth=2.4, color=INK))
-    if frames.indexes(Side.THINGS):
-        out.append(entry("box", marker="s", color=SIDE_COLOURS[Side.THINGS]))
-    if frames.scene.sites_m:
-        out.append(entry("site", marker="s", color=SITES[0]))
-    return out
+    return out + scene_entries(frames)

@@ -25,12 +25,14 @@ from sim_pkg.render_stage import (
     SHIELD,
     SIDE_COLOURS,
     SITE_DONE,
-    SITES,
     Stage,
     box_corners,
     entry,
     letter,
     outcome,
+    scene_entries,
+    site_colour,
+    site_entry,
     sites,
     whole_file,
 )
@@ -122,7 +124,7 @@ class _Film:
         self._radii = np.array([frames.actors[i].radius_m for i in self._discs])
         self._vital = bool(frames.indexes(Side.OPPONENTS))
         ax = stage.ax
-        self._sites = sites(frames)
+        self._sites = sites(frames.scene)
         for patch in self._sites:
             ax.add_patch(patch)
         self._trails: Any = ax.add_collection(LineCollection([], linewidths=1.6, zorder=4))
@@ -190,7 +192,7 @@ class _Film:
         self._crates.set_facecolor(SIDE_COLOURS[Side.THINGS])
         for i, patch in enumerate(self._sites):
             done = frames.sites_done[shown, i]
-            patch.set_facecolor(SITE_DONE if done else SITES[i % len(SITES)])
+            patch.set_facecolor(SITE_DONE if done else site_colour(frames.scene, i))
         clock = f"step {shown}, {at * frames.dt_s:.1f} s, return {frames.returns[shown]:.2f}"
         self._stage.clock.set_text(clock if shown < frames.steps else outcome(frames))
 
@@ -261,7 +263,6 @@ def _where(shown: npt.NDArray[np.bool_], places: npt.NDArray[Any]) -> npt.NDArra
 
 def _legend(frames: Frames) -> list[Any]:
     edge = {"markeredgecolor": INK}
-    square = {"marker": "s"}
     out = [entry("robot", color=SIDE_COLOURS[Side.ROBOTS])]
     if frames.crashed.any():
         out.append(entry("crashed robot", markerfacecolor=CRASHED, **edge))
@@ -275,9 +276,7 @@ def _legend(frames: Frames) -> list[Any]:
         out.append(entry("being hit", color=HIT))
     if not frames.alive[-1].all():
         out.append(entry("dead", marker="x", color=INK, markeredgewidth=2.4))
-    if frames.indexes(Side.THINGS):
-        out.append(entry("box", color=SIDE_COLOURS[Side.THINGS], **square))
+    out += scene_entries(frames)
     if frames.scene.sites_m:
-        out.append(entry("site", color=SITES[0], **square))
-        out.append(entry("site, done", color=SITE_DONE, **square))
+        out.append(site_entry(frames.scene, done=True))
     return out

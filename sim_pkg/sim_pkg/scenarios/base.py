@@ -25,6 +25,7 @@ class Scene:
     cell_m: float  # side of a grid cell; 0: no grid
     radii_m: tuple[float, ...]  # of each robot
     sites_m: tuple[tuple[float, float], ...]  # centres of the m places that the task is about
+    site_name: str = "site"  # what such a place is called
     site_radius_m: float = 0.0  # of a round site; 0: a site is a cell
     boxes_m: tuple[tuple[float, float], ...] = ()  # width, height of each of the World's boxes
     rough_m: tuple[tuple[float, float, float, float], ...] = ()  # x1, y1, x2, y2 of rough floor

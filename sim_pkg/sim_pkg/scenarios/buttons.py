@@ -112,6 +112,7 @@ class Buttons:
             cell_m=cell_m,
             radii_m=(config.robot.radius_m,) * n,
             sites_m=tuple((x, y) for x, y in self._centres(self._buttons).tolist()),
+            site_name="button",
         )
         self.world = self._world(config, self.scene.arena_m)
 

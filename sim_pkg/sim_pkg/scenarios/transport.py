@@ -148,6 +148,7 @@ class Transport:
             cell_m=0.0,
             radii_m=(config.robot.radius_m,) * n,
             sites_m=(config.goal,),
+            site_name="goal",
             site_radius_m=config.goal_radius_m,
             boxes_m=((config.box.width_m, config.box.height_m),),
             rough_m=config.floor.rough,
