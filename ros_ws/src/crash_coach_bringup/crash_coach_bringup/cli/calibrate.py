@@ -73,16 +73,14 @@ def rows_of(
 
 
 def show(title: str, rows: Sequence[dict[str, Any]]) -> None:
-    columns = ["policy", "crash", "success (95 %)", "steps", "robots lost", "opp. lost", "return"]
-    out = table(title, columns)
+    out = table(title, ["policy", "crash", "success (95 %)", "steps", "lost own/opp.", "return"])
     for row in rows:
         out.add_row(
             row["policy"],
             row["condition"],
             percent_ci(row["success_rate"], row["success_ci95"]),
             f"{row['steps_mean']:.0f}",
-            f"{row['robots_lost_mean']:.1f}",
-            f"{row['opponents_lost_mean']:.1f}",
+            f"{row['robots_lost_mean']:.1f} / {row['opponents_lost_mean']:.1f}",
             f"{row['return_mean']:.1f}",
         )
     console.print(out)
