@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from crash_coach_bringup.ros.probe import find_executable
-from policy_pkg.train.evaluate import Scripted, evaluate, named
+from policy_pkg.train.evaluate import Scripted, evaluate, exactly, named
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 
@@ -83,3 +83,36 @@ def test_a_wrong_scripted_team_is_named() -> None:
         "evaluate", "scripted:nearest", "--scenario", "buttons"
     )
     assert "--via ros" in refused("evaluate", *RANDOM, "--via", "ros")
+
+
+def test_calibrate_counts_wins_and_losses(tmp_path: Path) -> None:
+    out = tmp_path / "calibration.json"
+    done = crash_coach(
+        *("calibrate", "skirmish/3m", "buttons", "--policy", "random", "hold"),
+        *("--crashed", "0", "1", "--episodes", "8", "--json", str(out)),
+    )
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(out.read_text())["rows"]
+    assert [(r["scenario"], r["policy"], r["condition"]) for r in rows] == [
+        (scenario, policy, condition)
+        for scenario in ("skirmish/3m", "buttons")
+        for policy in ("random", "hold")
+        for condition in ("0 crashed", "1 crashed")
+    ]
+    held = rows[2]
+    assert (held["success_rate"], held["robots_lost_mean"], held["opponents_lost_mean"]) == (
+        0,
+        3,
+        0,
+    )
+    played = evaluate(Scripted("random"), "skirmish/3m", exactly(1, "stay"), 8, 0).summary()
+    for name in ("success_rate", "success_ci95", "steps_mean", "return_mean"):
+        assert rows[1][name] == pytest.approx(played[name])
+    assert rows[4]["robots_lost_mean"] == 0
+
+
+def test_calibrate_refuses_what_it_cannot_play() -> None:
+    assert "no scenario" in refused("calibrate")
+    assert "does not play scenario 'buttons'" in refused(
+        "calibrate", "buttons", "--policy", "kite", "--episodes", "1"
+    )
