@@ -143,11 +143,7 @@ def _table(rows: Sequence[dict[str, Any]]) -> str:
 def _cell(result: dict[str, Any], seeds: int) -> str:
     low, high = result["success_ci95"]
     returns = ", ".join(f"{value:g}" for value in result["returns"])
-    return (
-        f"{result['successes']} of {seeds} ({low:.0%}..{high:.0%}); returns {returns}; "
-        f"IQM {result['return_iqm']:.1f} ({result['return_iqm_ci95'][0]:.1f}.."
-        f"{result['return_iqm_ci95'][1]:.1f})"
-    )
+    return f"{result['successes']} of {seeds} ({100 * low:.0f}..{100 * high:.0f} %): {returns}"
 
 
 if __name__ == "__main__":
