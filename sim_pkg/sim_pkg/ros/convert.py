@@ -9,8 +9,10 @@ through numpy views of their arrays.
 
 from __future__ import annotations
 
+import math
 import struct
 from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +25,7 @@ from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from sim_pkg.contract import EnvSpec, UserError
+from sim_pkg.frames import Side, actors, vitals
 from sim_pkg.lockstep import Health
 from sim_pkg.scenarios.base import Scene
 from sim_pkg.session import Session
@@ -41,7 +44,12 @@ _BLUE = ColorRGBA(r=0.2, g=0.4, b=0.85, a=1.0)
 _YELLOW = ColorRGBA(r=0.95, g=0.75, b=0.1, a=1.0)
 _GREEN = ColorRGBA(r=0.2, g=0.7, b=0.3, a=1.0)
 _GREY = ColorRGBA(r=0.5, g=0.5, b=0.5, a=1.0)
-_ROBOT_HEIGHT_M = 0.3
+_COLOURS = {
+    Side.ROBOTS: _BLUE,
+    Side.OPPONENTS: ColorRGBA(r=0.85, g=0.5, b=0.1, a=1.0),
+    Side.THINGS: ColorRGBA(r=0.55, g=0.42, b=0.27, a=1.0),
+}
+_BODY_HEIGHT_M, _SITE_HEIGHT_M = 0.3, 0.02
 _LEVELS = {
     Health.OK: DiagnosticStatus.OK,
     Health.FAULTED: DiagnosticStatus.WARN,
@@ -170,19 +178,35 @@ def odometry(session: Session, header: Header, robot: int) -> Odometry:
 
 
 def markers(session: Session, header: Header) -> MarkerArray:
-    """Robots (crashed ones red), sites (green once done) and the arena's outline."""
-    scene = session.env.scene
+    """Robots (crashed ones red), opponents, boxes, sites (green once done), the arena's outline.
+
+    The dead are deleted: their markers would stay where they fell.
+    """
+    env, scene = session.env, session.env.scene
     result = MarkerArray()
-    for i, (x, y) in enumerate(session.env.positions_m[0].tolist()):
-        colour = _RED if session.crashed[i] else _BLUE
-        size = 2 * scene.radii_m[i]
-        result.markers.append(
-            _solid(header, "robots", i, Marker.CYLINDER, (x, y), (size, _ROBOT_HEIGHT_M), colour)
-        )
-    for i, (x, y) in enumerate(scene.sites_m):
-        colour = _GREEN if session.env.sites_done[0, i] else _YELLOW
-        size = scene.cell_m or 1.0
-        result.markers.append(_solid(header, "sites", i, Marker.CUBE, (x, y), (size, 0.02), colour))
+    places = env.world.bodies[0, :, :2].tolist()
+    angles = env.world.turns[0, :, 0].tolist()
+    health, _ = vitals(env, 0)
+    for i, actor in enumerate(actors(env)):
+        side = 2 * actor.radius_m
+        width, depth = actor.size_m or (side, side)
+        kind = Marker.CYLINDER if actor.size_m is None else Marker.CUBE
+        crashed = actor.side is Side.ROBOTS and bool(session.crashed[i])
+        colour = _RED if crashed else _COLOURS[actor.side]
+        size = (width, depth, _BODY_HEIGHT_M)
+        marker = _solid(header, actor.side.name.lower(), i, kind, places[i], size, colour)
+        marker.pose.orientation.z = math.sin(angles[i] / 2)
+        marker.pose.orientation.w = math.cos(angles[i] / 2)
+        if health[i] <= 0:
+            marker.action = Marker.DELETE
+        result.markers.append(marker)
+    round_sites = scene.site_radius_m > 0
+    kind = Marker.CYLINDER if round_sites else Marker.CUBE
+    side = 2 * scene.site_radius_m if round_sites else scene.cell_m
+    for i, place in enumerate(scene.sites_m):
+        colour = _GREEN if env.sites_done[0, i] else _YELLOW
+        size = (side, side, _SITE_HEIGHT_M)
+        result.markers.append(_solid(header, "sites", i, kind, place, size, colour))
     result.markers.append(_outline(header, scene))
     return result
 
@@ -192,17 +216,16 @@ def _solid(
     namespace: str,
     number: int,
     kind: int,
-    centre_m: tuple[float, float],
-    size_m: tuple[float, float],
+    centre_m: Sequence[float],
+    size_m: tuple[float, float, float],
     colour: ColorRGBA,
 ) -> Marker:
-    """A cylinder or box of (width, height) that stands on the floor."""
+    """A cylinder or box of (width, depth, height), parallel to the axes, on the floor."""
     marker = Marker(header=header, ns=namespace, id=number, type=kind, color=colour)
     marker.pose.position.x, marker.pose.position.y = centre_m
-    marker.pose.position.z = size_m[1] / 2
+    marker.pose.position.z = size_m[2] / 2
     marker.pose.orientation.w = 1.0
-    marker.scale.x = marker.scale.y = size_m[0]
-    marker.scale.z = size_m[1]
+    marker.scale.x, marker.scale.y, marker.scale.z = size_m
     return marker
 
 
