@@ -93,7 +93,12 @@ def load_tree(path: Path) -> YamlTree:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not UTF-8 text") from error
-    loader = _Loader(text)
+    try:
+        loader = _Loader(text)
+    except yaml.reader.ReaderError as error:
+        number = text.count("\n", 0, error.position) + 1
+        what = f"control character {chr(error.character)!r}"
+        raise ConfigError(f"{path}:{number}: not valid YAML: {what}") from error
     try:
         node = loader.get_single_node()
         if not isinstance(node, yaml.MappingNode):
@@ -104,6 +109,8 @@ def load_tree(path: Path) -> YamlTree:
     except yaml.MarkedYAMLError as error:
         line = f":{error.problem_mark.line + 1}" if error.problem_mark else ""
         raise ConfigError(f"{path}{line}: not valid YAML: {error.problem}") from error
+    except RecursionError as error:
+        raise ConfigError(f"{path}: nested too deeply, or an alias contains itself") from error
     finally:
         loader.dispose()
     return YamlTree(path, values, lines)

@@ -55,7 +55,7 @@ def make_env(scenario: str | Path, n_arenas: int) -> Env:
         raise ValueError(f"n_arenas is {n_arenas}; at least 1 is needed")
     tree = load_tree(find_scenario(scenario))
     kind = tree.values.get("kind")
-    if kind not in KINDS:
+    if not isinstance(kind, str) or kind not in KINDS:
         raise ConfigError(
             f"{tree.where(('kind',))}: kind = {kind!r}{did_you_mean(str(kind), KINDS)}; "
             f"one of: {', '.join(KINDS)}"

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from bad_files import check_refused
 
 from sim_pkg.config import SCENARIOS_DIR, ConfigError, scenario_names
 from sim_pkg.env import make_env
@@ -50,13 +51,7 @@ OUTSIDE = r"start_m = \[9, 7.3\]: outside the walls, .* cannot reach it; .* y in
     ],
 )
 def test_bad_maps(tmp_path: Path, old: str, new: str, message: str) -> None:
-    assert GOOD.count(old) == 1
-    path = tmp_path / "bad.yaml"
-    path.write_text(GOOD.replace(old, new))
-    with pytest.raises(ConfigError, match=message) as error:
-        make_env(path, 1)
-    assert "bad.yaml" in str(error.value)
-    assert "\n" not in str(error.value)
+    check_refused(tmp_path, GOOD, old, new, message)
 
 
 def with_unit(tmp_path: Path, name: str, **changes: object) -> Path:
@@ -85,6 +80,9 @@ def test_a_user_adds_a_unit_type_in_yaml_alone(tmp_path: Path) -> None:
         ({"hits_s": [1.2]}, r"ogre.hits_s = \[1.2\]: .*within the cooldown, at most at 1.075"),
         ({"hits_s": []}, r"ogre.hits_s = \[\]: .*at least 1"),
         ({"cooldown_s": 0.1}, r"ogre.cooldown_s = 0.1: .*greater than or equal to 0.25"),
+        ({"body_radius_m": 0.6}, r"ogre.body_radius_m = 0.6: at most radius_m, 0.5"),
+        ({"radius_m": 9, "body_radius_m": 4}, r"ogre.body_radius_m = 4: .*less than or equal to 3"),
+        ({"health": 1e300}, r"ogre.health = 1e\+300: .*less than or equal to"),
         ({"health": 0}, r"ogre.health = 0: .*greater than 0"),
         ({"friction": 1.5}, r"ogre.friction = 1.5: .*less than or equal to 1"),
         ({"colour": "red"}, r"unknown key 'unit_types.ogre.colour'"),

@@ -7,14 +7,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 
 from sim_pkg.config import StrictModel
 from sim_pkg.contract import BoolArray, EnvSpec, FloatArray, IntArray, RewardArray
 from sim_pkg.world import Float64Array, World, WorldSpec
+
+# What every kind's configuration may say; beyond these, numbers overflow or memory ends.
+EpisodeLimit = Annotated[int, Field(ge=1, le=100_000)]
+StepSeconds = Annotated[float, Field(gt=0, le=10)]
+MassKg = Annotated[float, Field(ge=1e-3, le=1e6)]
+SpeedMps = Annotated[float, Field(gt=0, le=1e3)]
+
+
+class PhysicsConfig(StrictModel):
+    substeps: int = Field(ge=4, le=1000)
+    iterations: int = Field(ge=1, le=1000)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,17 @@ from pydantic import Field, model_validator
 
 from sim_pkg.config import StrictModel
 from sim_pkg.contract import BoolArray, EnvSpec, IntArray
-from sim_pkg.scenarios.base import Buffers, Kind, Scene, robot_names
+from sim_pkg.scenarios.base import (
+    Buffers,
+    EpisodeLimit,
+    Kind,
+    MassKg,
+    PhysicsConfig,
+    Scene,
+    SpeedMps,
+    StepSeconds,
+    robot_names,
+)
 from sim_pkg.world import DiscSpec, Float64Array, World, WorldSpec, box_walls
 
 ACTIONS = ("up", "down", "left", "right", "stay")
@@ -29,14 +39,9 @@ Cell = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
 
 class RobotConfig(StrictModel):
     radius_m: float = Field(gt=0)
-    mass_kg: float = Field(gt=0)
+    mass_kg: MassKg
     friction: float = Field(ge=0, le=1)
-    max_speed_mps: float = Field(gt=0)
-
-
-class PhysicsConfig(StrictModel):
-    substeps: int = Field(ge=4, le=1000)
-    iterations: int = Field(ge=1, le=1000)
+    max_speed_mps: SpeedMps
 
 
 class ButtonsConfig(StrictModel):
@@ -46,8 +51,8 @@ class ButtonsConfig(StrictModel):
     rows: int = Field(ge=2, le=1000)
     columns: int = Field(ge=2, le=1000)
     cell_m: float = Field(gt=0)
-    dt_s: float = Field(gt=0)
-    episode_limit: int = Field(ge=1)
+    dt_s: StepSeconds
+    episode_limit: EpisodeLimit
     starts: tuple[Cell, ...] = Field(min_length=1)
     buttons: tuple[Cell, ...] = Field(min_length=1)
     reward_step: float

@@ -27,35 +27,26 @@ import numpy as np
 from numba import njit
 from pydantic import Field, model_validator
 
-from sim_pkg.config import Misplaced, StrictModel
-from sim_pkg.contract import BoolArray, EnvSpec, IntArray
+from sim_pkg.config import Misplaced
+from sim_pkg.contract import BoolArray, IntArray
 from sim_pkg.scenarios import drive
-from sim_pkg.scenarios.base import Buffers, Kind, Scene, episode_rng, robot_names
-from sim_pkg.scenarios.drive import Metres, PhysicsConfig, Point, RobotConfig, clip
-from sim_pkg.world import Float64Array, World, WorldSpec
+from sim_pkg.scenarios.base import Buffers, Kind, Scene, episode_rng
+from sim_pkg.scenarios.drive import DrivenConfig, Metres, Point, clip
+from sim_pkg.world import Float64Array, World
 
 # Watching is counted in floating-point seconds.
 _DONE_S = 1e-9
 
 
-class CoverageConfig(StrictModel):
+class CoverageConfig(DrivenConfig):
     """coverage.yaml; units are in its comments."""
 
     kind: Literal["coverage"]
-    arena_m: Point
-    dt_s: float = Field(gt=0)
-    episode_limit: int = Field(ge=1)
-    starts: tuple[Point, ...] = Field(min_length=1)
-    start_jitter_m: float = Field(ge=0)
-    sites: tuple[Point, ...] = Field(min_length=1)
+    sites: tuple[Point, ...] = Field(min_length=1, max_length=1000)
     watch_radius_m: Metres
     watch_speed_mps: float = Field(gt=0)
     watch_s: float = Field(gt=0)
-    sight_m: Metres
     reward_site: float
-    reward_step: float
-    robot: RobotConfig
-    physics: PhysicsConfig
 
     @model_validator(mode="after")
     def _check(self) -> CoverageConfig:
@@ -85,16 +76,8 @@ class Coverage:
         self._arena_m = np.array(config.arena_m)
         self._left_s = np.zeros((n_arenas, m))
         self._steps = np.zeros(n_arenas, dtype=np.int32)
-        self.spec = EnvSpec(
-            scenario=name,
-            robots=robot_names(n),
-            action_names=drive.ACTIONS,
-            stay_actions=(drive.STAY,),
-            obs_size=4 + 4 * m + 3 * (n - 1),
-            state_size=4 * n + 3 * m + 1,
-            episode_limit=config.episode_limit,
-            dt_s=config.dt_s,
-            bounds=(-1.0, 1.0),
+        self.spec = config.spec(
+            name, obs_size=4 + 4 * m + 3 * (n - 1), state_size=4 * n + 3 * m + 1
         )
         self.scene = Scene(
             arena_m=config.arena_m,
@@ -103,17 +86,7 @@ class Coverage:
             sites_m=config.sites,
             site_radius_m=config.watch_radius_m,
         )
-        self.world = WorldSpec(
-            discs=(config.robot.disc(),) * n,
-            walls_m=drive.walls(config.arena_m),
-            wall_radius_m=drive.WALL_RADIUS_M,
-            wall_friction=config.robot.friction,
-            dt_s=config.dt_s,
-            substeps=config.physics.substeps,
-            iterations=config.physics.iterations,
-            slop_m=drive.SLOP_M,
-            penetration_left=drive.PENETRATION_LEFT,
-        )
+        self.world = config.world(wall_friction=config.robot.friction)
 
     def begin(self, arena: int, seed: int, episode: int) -> Float64Array:
         self._left_s[arena] = self.config.watch_s

@@ -9,7 +9,16 @@ from numba import njit
 from pydantic import Field
 
 from sim_pkg.config import Misplaced, StrictModel
-from sim_pkg.world import DiscSpec, box_walls
+from sim_pkg.contract import EnvSpec
+from sim_pkg.scenarios.base import (
+    EpisodeLimit,
+    MassKg,
+    PhysicsConfig,
+    SpeedMps,
+    StepSeconds,
+    robot_names,
+)
+from sim_pkg.world import BoxSpec, DiscSpec, WorldSpec, box_walls
 
 ACTIONS = (
     "stay", "east", "north_east", "north", "north_west", "west", "south_west", "south",
@@ -33,23 +42,58 @@ Point = tuple[Annotated[float, Field(ge=0, le=1000)], Annotated[float, Field(ge=
 
 class RobotConfig(StrictModel):
     radius_m: Metres
-    mass_kg: float = Field(gt=0)
+    mass_kg: MassKg
     friction: float = Field(ge=0, le=1)
-    max_speed_mps: float = Field(gt=0)
-    max_force_n: float = Field(gt=0)
+    max_speed_mps: SpeedMps
+    max_force_n: float = Field(gt=0, le=1e9)
 
     def disc(self) -> DiscSpec:
         return DiscSpec(self.radius_m, self.mass_kg, self.friction, drive_n=self.max_force_n)
 
 
-class PhysicsConfig(StrictModel):
-    substeps: int = Field(ge=4, le=1000)
-    iterations: int = Field(ge=1, le=1000)
+class DrivenConfig(StrictModel):
+    """The keys that both kinds have."""
 
+    arena_m: Point
+    dt_s: StepSeconds
+    episode_limit: EpisodeLimit
+    starts: tuple[Point, ...] = Field(min_length=1, max_length=64)
+    start_jitter_m: float = Field(ge=0)
+    sight_m: Metres
+    reward_step: float
+    robot: RobotConfig
+    physics: PhysicsConfig
 
-def walls(arena_m: Point) -> tuple[tuple[float, float, float, float], ...]:
-    """Four walls whose inner faces are the arena's edges."""
-    return box_walls(*arena_m, 0.0, WALL_RADIUS_M)
+    def world(
+        self, wall_friction: float, boxes: tuple[BoxSpec, ...] = (), speed_left: float = 1.0
+    ) -> WorldSpec:
+        """The robots, ``boxes`` and four walls whose inner faces are the arena's edges."""
+        return WorldSpec(
+            discs=(self.robot.disc(),) * len(self.starts),
+            boxes=boxes,
+            walls_m=box_walls(*self.arena_m, 0.0, WALL_RADIUS_M),
+            wall_radius_m=WALL_RADIUS_M,
+            wall_friction=wall_friction,
+            dt_s=self.dt_s,
+            substeps=self.physics.substeps,
+            iterations=self.physics.iterations,
+            slop_m=SLOP_M,
+            penetration_left=PENETRATION_LEFT,
+            speed_left=speed_left,
+        )
+
+    def spec(self, name: str, obs_size: int, state_size: int) -> EnvSpec:
+        return EnvSpec(
+            scenario=name,
+            robots=robot_names(len(self.starts)),
+            action_names=ACTIONS,
+            stay_actions=(STAY,),
+            obs_size=obs_size,
+            state_size=state_size,
+            episode_limit=self.episode_limit,
+            dt_s=self.dt_s,
+            bounds=(-1.0, 1.0),
+        )
 
 
 def check_starts(

@@ -11,15 +11,18 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from sim_pkg.config import Misplaced, StrictModel, did_you_mean, load_yaml_strict
-from sim_pkg.scenarios.skirmish_layout import Layout
+from sim_pkg.scenarios.base import EpisodeLimit, MassKg, PhysicsConfig, SpeedMps, StepSeconds
+from sim_pkg.scenarios.skirmish_layout import ATTACK_M, Layout
 
 UNITS_FILE = Path(__file__).parent.parent / "configs" / "units.yaml"
 
 TICK_S = 1 / 16  # StarCraft II's game loop at its "Normal" speed
 PHASES = 2  # how often in a control step velocities are commanded anew
 
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
+# Far beyond any use; sums and squares of more would not be finite.
+LARGEST = 1e9
+Positive = Annotated[float, Field(gt=0, le=LARGEST)]
+NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 Point = tuple[float, float]
 
 
@@ -33,15 +36,27 @@ class UnitConfig(StrictModel):
     armour: NotNegative
     armoured: bool
     radius_m: Positive
-    body_radius_m: Positive
-    mass_kg: Positive
+    # An attack on a body that one touches can be ordered.
+    body_radius_m: float = Field(gt=0, le=ATTACK_M / 2)
+    mass_kg: MassKg
     friction: float = Field(ge=0, le=1)
-    speed_mps: Positive
+    speed_mps: SpeedMps
     damage: Positive
     damage_to_armoured: NotNegative
     reach_m: Positive
-    cooldown_s: float = Field(ge=4 * TICK_S)
+    cooldown_s: float = Field(ge=4 * TICK_S, le=LARGEST)
     hits_s: tuple[NotNegative, ...] = Field(min_length=1, max_length=8)
+
+    @field_validator("body_radius_m")
+    @classmethod
+    def _within_reach(cls, body_radius_m: float, info: ValidationInfo) -> float:
+        radius_m = info.data.get("radius_m", math.inf)
+        if body_radius_m > radius_m:
+            raise ValueError(
+                f"at most radius_m, {radius_m:g}: reach is measured from that, and a larger body "
+                "would keep attackers off"
+            )
+        return body_radius_m
 
     @field_validator("hits_s")
     @classmethod
@@ -71,9 +86,8 @@ class BehaviourConfig(StrictModel):
     patience_s: NotNegative
 
 
-class PhysicsConfig(StrictModel):
+class PhasesConfig(PhysicsConfig):
     substeps: int = Field(ge=4, le=1000, multiple_of=PHASES)
-    iterations: int = Field(ge=1, le=1000)
 
 
 class SkirmishConfig(StrictModel):
@@ -83,15 +97,15 @@ class SkirmishConfig(StrictModel):
     """
 
     kind: Literal["skirmish"]
-    dt_s: float = Field(gt=0, le=10)
-    episode_limit: int = Field(ge=1, le=100_000)
+    dt_s: StepSeconds
+    episode_limit: EpisodeLimit
     arena_m: tuple[Positive, Positive]
     free_m: tuple[NotNegative, NotNegative, Positive, Positive]
     robots: tuple[PlacedUnit, ...] = Field(min_length=1, max_length=64)
     opponents: tuple[PlacedUnit, ...] = Field(min_length=1, max_length=64)
     jitter_m: NotNegative
     behaviour: BehaviourConfig
-    physics: PhysicsConfig
+    physics: PhasesConfig
     unit_types: dict[str, UnitConfig] = Field(default_factory=dict)
 
     @property

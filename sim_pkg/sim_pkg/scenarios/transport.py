@@ -35,11 +35,11 @@ from numba import njit
 from pydantic import Field, model_validator
 
 from sim_pkg.config import Misplaced, StrictModel
-from sim_pkg.contract import BoolArray, EnvSpec, IntArray
+from sim_pkg.contract import BoolArray, IntArray
 from sim_pkg.scenarios import drive
-from sim_pkg.scenarios.base import Buffers, Kind, Scene, episode_rng, robot_names
-from sim_pkg.scenarios.drive import Metres, PhysicsConfig, Point, RobotConfig, clip
-from sim_pkg.world import BoxSpec, Float64Array, World, WorldSpec
+from sim_pkg.scenarios.base import Buffers, Kind, MassKg, Scene, episode_rng
+from sim_pkg.scenarios.drive import DrivenConfig, Metres, Point, clip
+from sim_pkg.world import BoxSpec, Float64Array, World
 
 GRAVITY_MPS2 = 9.81
 
@@ -47,7 +47,7 @@ GRAVITY_MPS2 = 9.81
 class BoxConfig(StrictModel):
     width_m: Metres
     height_m: Metres
-    mass_kg: float = Field(gt=0)
+    mass_kg: MassKg
     friction: float = Field(ge=0, le=1)
     start: Point
 
@@ -78,25 +78,16 @@ class FloorConfig(StrictModel):
         return self
 
 
-class TransportConfig(StrictModel):
+class TransportConfig(DrivenConfig):
     """transport.yaml; units are in its comments."""
 
     kind: Literal["transport"]
-    arena_m: Point
-    dt_s: float = Field(gt=0)
-    episode_limit: int = Field(ge=1)
-    starts: tuple[Point, ...] = Field(min_length=1)
-    start_jitter_m: float = Field(ge=0)
     goal: Point
     goal_radius_m: Metres
-    sight_m: Metres
     reward_metre: float
     reward_goal: float
-    reward_step: float
-    robot: RobotConfig
     box: BoxConfig
     floor: FloorConfig
-    physics: PhysicsConfig
 
     @model_validator(mode="after")
     def _check(self) -> TransportConfig:
@@ -132,17 +123,7 @@ class Transport:
         self._rough_m = np.array(config.floor.rough).reshape(-1, 4)
         self._gap_m = np.zeros(n_arenas)
         self._steps = np.zeros(n_arenas, dtype=np.int32)
-        self.spec = EnvSpec(
-            scenario=name,
-            robots=robot_names(n),
-            action_names=drive.ACTIONS,
-            stay_actions=(drive.STAY,),
-            obs_size=12 + 3 * (n - 1),
-            state_size=4 * n + 7,
-            episode_limit=config.episode_limit,
-            dt_s=config.dt_s,
-            bounds=(-1.0, 1.0),
-        )
+        self.spec = config.spec(name, obs_size=12 + 3 * (n - 1), state_size=4 * n + 7)
         self.scene = Scene(
             arena_m=config.arena_m,
             cell_m=0.0,
@@ -153,17 +134,9 @@ class Transport:
             boxes_m=((config.box.width_m, config.box.height_m),),
             rough_m=config.floor.rough,
         )
-        self.world = WorldSpec(
-            discs=(config.robot.disc(),) * n,
-            boxes=(config.box.spec(),),
-            walls_m=drive.walls(config.arena_m),
-            wall_radius_m=drive.WALL_RADIUS_M,
+        self.world = config.world(
             wall_friction=config.box.friction,
-            dt_s=config.dt_s,
-            substeps=config.physics.substeps,
-            iterations=config.physics.iterations,
-            slop_m=drive.SLOP_M,
-            penetration_left=drive.PENETRATION_LEFT,
+            boxes=(config.box.spec(),),
             speed_left=float(np.exp(-config.floor.drag_per_s)),
         )
 
