@@ -63,6 +63,8 @@ def test_it_draws_a_trained_team_on_its_own_scenario(tmp_path: Path) -> None:
         (("--out", "x.avi"), "x.avi: a file ending in .mp4, .gif, .png"),
         (("--out", "/no/where/x.png"), "no folder /no/where"),
         (("--out", "x.png", "--speed", "0"), "--speed 0.0"),
+        (("--out", "x.png", "--episode", str(10**20)), "--episode"),
+        (("--out", "x.png", "--json", "."), "--json .: is a directory"),
         (("--out", "x.png", "--crashed", "9"), "--crashed 9: the team has 2 robots"),
         (("--out", "x.png", "--crashed", "1", "--victims", "robot_1"), "under one of them"),
     ],
@@ -116,3 +118,6 @@ def test_calibrate_refuses_what_it_cannot_play() -> None:
     assert "does not play scenario 'buttons'" in refused(
         "calibrate", "buttons", "--policy", "kite", "--episodes", "1"
     )
+    done = crash_coach("calibrate", "buttons", "coverag", "--policy", "hold", "--episodes", "1")
+    assert "unknown scenario 'coverag' (did you mean 'coverage'?)" in done.stderr
+    assert done.stdout == "", "refused before anything is played"

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from crash_coach_bringup.cli.evaluate import CrashMode, conditions
+from crash_coach_bringup.cli.evaluate import MOST_EPISODES, CrashMode, conditions
 from crash_coach_bringup.cli.output import (
     CliError,
     check_json_target,
@@ -43,24 +43,27 @@ def figures(episodes: Sequence[Frames]) -> dict[str, Any]:
     }
 
 
-def rows_of(
-    scenario: str,
-    policies: list[str],
-    crashed: list[int],
-    mode: CrashMode,
-    episodes: int,
-    seed: int,
-) -> list[dict[str, Any]]:
-    """A row per policy and number of crashed robots."""
+def asked_of(
+    scenario: str, policies: list[str], crashed: list[int], mode: CrashMode
+) -> list[tuple[str, Condition]]:
+    """Every policy under every condition.
+
+    Raises:
+        CliError: more crashed robots than there are.
+        ConfigError: unknown or wrong scenario, or a policy that does not play it.
+    """
     env = make_env(scenario, 1)
     names = policies or list(scripted_names(env))
     for name in names:
-        make_scripted(name, env)  # refuses those that do not play it, before any is played
-    asked: list[tuple[str, Condition]] = [
-        (name, condition)
-        for name in names
-        for condition in conditions(env.spec.robots, [], crashed, [], mode)
-    ]
+        make_scripted(name, env)
+    under = conditions(env.spec.robots, [], crashed, [], mode)
+    return [(name, condition) for name in names for condition in under]
+
+
+def rows_of(
+    scenario: str, asked: Sequence[tuple[str, Condition]], episodes: int, seed: int
+) -> list[dict[str, Any]]:
+    """A row per policy and condition."""
     return [
         {
             "scenario": scenario,
@@ -97,7 +100,9 @@ def calibrate(
         list[int] | None, typer.Option(help="K ...: exactly K robots, drawn anew each episode.")
     ] = None,
     mode: Annotated[CrashMode, typer.Option(help="What a crashed robot does.")] = CrashMode.stay,
-    episodes: Annotated[int, typer.Option(help="Episodes of each.", min=1)] = 256,
+    episodes: Annotated[
+        int, typer.Option(help="Episodes of each.", min=1, max=MOST_EPISODES)
+    ] = 256,
     seed: Annotated[int, typer.Option(help="Seed of episodes and victims.", min=0)] = 0,
     json: Annotated[Path | None, typer.Option(help="Also write the figures to this file.")] = None,
 ) -> None:
@@ -105,9 +110,11 @@ def calibrate(
     check_json_target(json)
     if not scenarios:
         raise CliError("no scenario: name at least one, such as skirmish/3s_vs_5z")
+    # What is wrong is said before anything is played.
+    asked = {name: asked_of(name, policy or [], crashed or [], mode) for name in scenarios}
     rows: list[dict[str, Any]] = []
-    for scenario in scenarios:
-        here = rows_of(scenario, policy or [], crashed or [], mode, episodes, seed)
+    for scenario, played in asked.items():
+        here = rows_of(scenario, played, episodes, seed)
         show(f"{scenario}: {episodes} episodes each, seed {seed}", here)
         rows += here
     write_json(json, {"seed": seed, "episodes": episodes, "mode": mode.value, "rows": rows})

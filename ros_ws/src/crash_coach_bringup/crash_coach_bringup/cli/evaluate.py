@@ -31,6 +31,8 @@ from policy_pkg.train.evaluate import (
 from policy_pkg.train.evaluate import evaluate as evaluate_in_core
 from sim_pkg.trajectory import combine
 
+MOST_EPISODES = 1_000_000
+
 
 class CrashMode(StrEnum):
     stay = "stay"
@@ -130,7 +132,9 @@ def evaluate(
     scenario: Annotated[
         str | None, typer.Option(help="Scenario name or YAML file; default: the trained team's.")
     ] = None,
-    episodes: Annotated[int, typer.Option(help="Episodes per condition.", min=1)] = 128,
+    episodes: Annotated[
+        int, typer.Option(help="Episodes per condition.", min=1, max=MOST_EPISODES)
+    ] = 128,
     crash_rate: Annotated[
         list[float] | None, typer.Option(help="R ...: each robot crashes with probability R.")
     ] = None,

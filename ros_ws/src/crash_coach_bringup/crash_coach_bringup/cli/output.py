@@ -39,10 +39,22 @@ def write_json(path: Path | None, result: Mapping[str, Any]) -> None:
         raise CliError(f"--json {path}: {error.strerror}: {error.filename}") from None
 
 
+def check_file_target(option: str, path: Path) -> None:
+    """Refuses a file that cannot be written before the work, not after it.
+
+    Raises:
+        CliError: a missing folder, or a directory in the way.
+    """
+    if not path.absolute().parent.is_dir():
+        raise CliError(f"{option} {path}: there is no folder {path.absolute().parent}")
+    if path.is_dir():
+        raise CliError(f"{option} {path}: is a directory")
+
+
 def check_json_target(path: Path | None) -> None:
-    """Refuses a --json target in a missing folder before the work, not after it."""
-    if path is not None and not path.absolute().parent.is_dir():
-        raise CliError(f"--json {path}: there is no folder {path.absolute().parent}")
+    """As ``check_file_target``, for an optional --json."""
+    if path is not None:
+        check_file_target("--json", path)
 
 
 def table(title: str, columns: list[str]) -> Table:

@@ -8,7 +8,13 @@ from typing import Annotated, Any
 import typer
 
 from crash_coach_bringup.cli.evaluate import CrashMode, conditions
-from crash_coach_bringup.cli.output import CliError, check_json_target, console, write_json
+from crash_coach_bringup.cli.output import (
+    CliError,
+    check_file_target,
+    check_json_target,
+    console,
+    write_json,
+)
 from crash_coach_bringup.cli.target import HELP, load_target
 from policy_pkg.train.evaluate import Condition, record
 from sim_pkg.frames import Frames
@@ -17,17 +23,14 @@ FILMS, STILLS = (".mp4", ".gif"), (".png",)
 
 
 def check_out(out: Path) -> None:
-    """Refuses a file that cannot be written before the work, not after it.
+    """As ``check_file_target``.
 
     Raises:
-        CliError: another suffix, a missing folder, or a directory in the way.
+        CliError: also for another suffix.
     """
     if out.suffix not in FILMS + STILLS:
         raise CliError(f"--out {out}: a file ending in {', '.join(FILMS + STILLS)} is needed")
-    if not out.absolute().parent.is_dir():
-        raise CliError(f"--out {out}: there is no folder {out.absolute().parent}")
-    if out.is_dir():
-        raise CliError(f"--out {out}: is a directory")
+    check_file_target("--out", out)
 
 
 def draw(frames: Frames, out: Path, speed: float) -> None:
@@ -72,7 +75,7 @@ def render(
         str | None, typer.Option(help="Scenario name or YAML file; default: the trained team's.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed, as of evaluate.", min=0)] = 0,
-    episode: Annotated[int, typer.Option(help="Number of the episode.", min=0)] = 0,
+    episode: Annotated[int, typer.Option(help="Its number.", min=0, max=2**32 - 1)] = 0,
     crash_rate: Annotated[
         float | None, typer.Option(help="Each robot crashes with this probability.")
     ] = None,
