@@ -1,4 +1,4 @@
-"""An episode as what can be drawn of it, step by step; render.py and video.py draw it."""
+"""An episode as what can be drawn of it, step by step; the render modules draw it."""
 
 from __future__ import annotations
 

@@ -4,8 +4,13 @@ A control step of ``dt_s`` has two phases. In each, every unit is commanded a ve
 advances, and the fight goes on for the phase's ticks of 1/16 s (skirmish_combat.py), with each
 unit on the straight line between its places before and after. So a chaser corrects its course
 every 0.25 s and a shot's moment is exact to a tick, whatever the physics' substeps are. Two phases
-are a compromise: with one, zealots lag behind whom they chase (the scripted `kite` needs 129 steps
-on 3s_vs_5z instead of 146 with two and 173 with four); four cost 1.4 times as much as two.
+are a compromise: with one, zealots lag behind whom they chase (the scripted `kite` needs about 130
+steps on 3s_vs_5z instead of 145 with two and 170 with four); four cost 1.4 times as much as two.
+
+Reward of a step: (the health and shield that the opponents lost, less what they regained, + 10
+per kill, + 200 for the win) x 20 / (their health and shield at the start + 10 each + 200), so a
+win sums to 20. The task ends with success when every opponent is dead and a robot lives; without
+when no robot lives, also where the last of both teams die at once, or at ``episode_limit``.
 
 The files: skirmish_layout.py says where everything is in observations, state and actions;
 skirmish_config.py what a map and a unit type may say; skirmish_tables.py holds both as arrays;
@@ -120,8 +125,7 @@ class Skirmish:
         deaths = skirmish_combat.fight(
             running, round(self._phase_s / TICK_S), TICK_S, world.bodies, tables.units,
             tables.hits_s, tables.damage, tables.reach_m, fight.extras_s, fight.clock_s,
-            fight.real, fight.whole,
-            self._hits,
+            fight.real, fight.whole, self._hits,
         )  # fmt: skip
         if deaths:
             alive = fight.whole[:, :, ALIVE] != 0
