@@ -12,10 +12,12 @@ from sim_pkg.contract import BoolArray, FloatArray
 from sim_pkg.env import Env
 from sim_pkg.scenarios.base import Scene
 from sim_pkg.scenarios.skirmish_config import SkirmishConfig
-from sim_pkg.scenarios.skirmish_layout import STATE_HEALTH, STATE_OPPONENT_HEALTH
-
-# Columns of the shield in a robot's and an opponent's part of a skirmish's state.
-_STATE_SHIELD, _STATE_OPPONENT_SHIELD = 4, 3
+from sim_pkg.scenarios.skirmish_layout import (
+    STATE_HEALTH,
+    STATE_OPPONENT_HEALTH,
+    STATE_OPPONENT_SHIELD,
+    STATE_SHIELD,
+)
 
 
 class Side(IntEnum):
@@ -188,8 +190,8 @@ def vitals(env: Env, arena: int) -> tuple[FloatArray, FloatArray]:
     robots, opponents = parts.robots, parts.opponents
     health = (robots[:, STATE_HEALTH], opponents[:, STATE_OPPONENT_HEALTH])
     shield = (
-        robots[:, _STATE_SHIELD] if layout.robot_shields else np.zeros(layout.n_robots),
-        opponents[:, _STATE_OPPONENT_SHIELD]
+        robots[:, STATE_SHIELD] if layout.robot_shields else np.zeros(layout.n_robots),
+        opponents[:, STATE_OPPONENT_SHIELD]
         if layout.opponent_shields
         else np.zeros(layout.n_opponents),
     )

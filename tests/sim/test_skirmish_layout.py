@@ -58,9 +58,8 @@ def test_splitting_is_by_view_and_leaves_nothing_out() -> None:
     np.testing.assert_array_equal(state, 1.0)
 
 
-def test_types_and_allies() -> None:
+def test_type_bits_where_a_team_is_mixed() -> None:
     layout = Layout.of(team("8s"), team("3s5z"), SHIELDED)
     assert layout.type_names == ("stalker", "zealot")
     assert layout.type_bits("zealot").tolist() == [0.0, 1.0]
-    assert [layout.ally(2, k) for k in range(7)] == [0, 1, 3, 4, 5, 6, 7]
     assert Layout.of(team("3s"), team("5z"), SHIELDED).type_names == ()

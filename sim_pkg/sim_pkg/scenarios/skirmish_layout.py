@@ -34,10 +34,9 @@ MOVE_M = 2.0  # how far away the point of a move order is
 # Columns of an opponent's and of an ally's part of an observation; shield and type bits follow.
 ATTACKABLE = VISIBLE = 0
 DISTANCE, DX, DY, HEALTH = 1, 2, 3, 4
-# Columns of the own part of an observation, of a robot's part of the state, of an opponent's.
-OWN_HEALTH = 0
-STATE_HEALTH, STATE_COOLDOWN, STATE_X, STATE_Y = 0, 1, 2, 3
-STATE_OPPONENT_HEALTH, STATE_OPPONENT_X, STATE_OPPONENT_Y = 0, 1, 2
+# Columns of a robot's part of the state and of an opponent's; the shield where a team has one.
+STATE_HEALTH, STATE_COOLDOWN, STATE_SHIELD = 0, 1, 4
+STATE_OPPONENT_HEALTH, STATE_OPPONENT_SHIELD = 0, 3
 
 
 @dataclass(frozen=True)
@@ -167,10 +166,6 @@ class Layout:
             opponents=opponents.reshape(*lead, self.n_opponents, self.state_opponent_width),
             last_actions=actions.reshape(*lead, self.n_robots, self.n_actions),
         )
-
-    def ally(self, observer: int, index: int) -> int:
-        """The robot that ``index`` of ``observer``'s allies is."""
-        return index + (index >= observer)
 
     def type_bits(self, unit: str) -> FloatArray:
         """(number of type names,) one-hot."""

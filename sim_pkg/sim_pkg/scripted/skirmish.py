@@ -12,7 +12,6 @@ takes the rest (its own and the opponents' unit types) from the map.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +30,14 @@ from sim_pkg.scenarios.skirmish_layout import (
     STOP,
     VISIBLE,
 )
-from sim_pkg.scenarios.skirmish_tables import EXTRA_S
+from sim_pkg.scenarios.skirmish_tables import (
+    COOLDOWN_S,
+    EXTRA_S,
+    MAX_HEALTH,
+    MAX_SHIELD,
+    SPEED_MPS,
+    Tables,
+)
 from sim_pkg.scripted.base import Entry
 from sim_pkg.scripted.skirmish_moves import (
     AWAY,
@@ -73,21 +79,19 @@ class _Map:
 
     @classmethod
     def of(cls, config: SkirmishConfig) -> _Map:
-        layout, n, units = config.layout, len(config.robots), config.units
-        radius = np.array([unit.radius_m for unit in units])
-        reach = np.array([unit.reach_m for unit in units])
+        layout, n, tables = config.layout, len(config.robots), Tables.of(config)
         # As early as it may be ready: it attacks as soon as it is.
-        rest = [math.ceil((unit.cooldown_s + EXTRA_S[0]) / config.dt_s) for unit in units[:n]]
+        rest = np.ceil((tables.units[:n, COOLDOWN_S] + EXTRA_S[0]) / config.dt_s)
         return cls(
             first=layout.opponents_at,
             width=layout.opponent_width,
             shielded=layout.opponent_shields,
             ally_first=layout.allies_at,
             ally_width=layout.ally_width,
-            full=np.array([(unit.health, unit.shield) for unit in units[n:]]),
-            speed_mps=np.array([unit.speed_mps for unit in units]),
-            reach_m=reach[:, None] + radius[:, None] + radius[None, :],
-            rest=np.array(rest, dtype=np.int32),
+            full=tables.units[n:, [MAX_HEALTH, MAX_SHIELD]],
+            speed_mps=tables.units[:, SPEED_MPS],
+            reach_m=tables.reach_m,
+            rest=rest.astype(np.int32),
         )
 
 

@@ -9,7 +9,13 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from crash_coach_bringup.cli.evaluate import MOST_EPISODES, CrashMode, conditions
+from crash_coach_bringup.cli.evaluate import (
+    MOST_EPISODES,
+    CrashedOption,
+    CrashMode,
+    ModeOption,
+    conditions,
+)
 from crash_coach_bringup.cli.output import (
     CliError,
     check_json_target,
@@ -96,10 +102,8 @@ def calibrate(
     policy: Annotated[
         list[str] | None, typer.Option(help="NAME ...: these; default: all that play it.")
     ] = None,
-    crashed: Annotated[
-        list[int] | None, typer.Option(help="K ...: exactly K robots, drawn anew each episode.")
-    ] = None,
-    mode: Annotated[CrashMode, typer.Option(help="What a crashed robot does.")] = CrashMode.stay,
+    crashed: CrashedOption = None,
+    mode: ModeOption = CrashMode.stay,
     episodes: Annotated[
         int, typer.Option(help="Episodes of each.", min=1, max=MOST_EPISODES)
     ] = 256,

@@ -40,6 +40,12 @@ class CrashMode(StrEnum):
     random = "random"
 
 
+CrashedOption = Annotated[
+    list[int] | None, typer.Option(help="K ...: exactly K robots, drawn anew each episode.")
+]
+ModeOption = Annotated[CrashMode, typer.Option(help="What a crashed robot does.")]
+
+
 class Via(StrEnum):
     core = "core"
     ros = "ros"
@@ -138,13 +144,11 @@ def evaluate(
     crash_rate: Annotated[
         list[float] | None, typer.Option(help="R ...: each robot crashes with probability R.")
     ] = None,
-    crashed: Annotated[
-        list[int] | None, typer.Option(help="K ...: exactly K robots, drawn anew each episode.")
-    ] = None,
+    crashed: CrashedOption = None,
     victims: Annotated[
         list[str] | None, typer.Option(help="ROBOT ...: these robots, in every episode.")
     ] = None,
-    mode: Annotated[CrashMode, typer.Option(help="What a crashed robot does.")] = CrashMode.stay,
+    mode: ModeOption = CrashMode.stay,
     via: Annotated[
         Via, typer.Option(help="In this process, or as a real ROS graph in lock-step.")
     ] = Via.core,

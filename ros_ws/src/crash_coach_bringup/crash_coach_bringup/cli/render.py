@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from crash_coach_bringup.cli.evaluate import CrashMode, conditions
+from crash_coach_bringup.cli.evaluate import CrashMode, ModeOption, conditions
 from crash_coach_bringup.cli.output import (
     CliError,
     check_file_target,
@@ -81,7 +81,7 @@ def render(
     ] = None,
     crashed: Annotated[int | None, typer.Option(help="So many robots crash, drawn.")] = None,
     victims: Annotated[list[str] | None, typer.Option(help="ROBOT ...: these robots.")] = None,
-    mode: Annotated[CrashMode, typer.Option(help="What a crashed robot does.")] = CrashMode.stay,
+    mode: ModeOption = CrashMode.stay,
     speed: Annotated[float, typer.Option(help="Of a film, times real time.")] = 1.0,
     json: Annotated[Path | None, typer.Option(help="Also write what happened here.")] = None,
 ) -> None:
