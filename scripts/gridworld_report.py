@@ -22,15 +22,15 @@ import typer
 
 from crash_coach_bringup.cli.output import write_json
 from crash_coach_bringup.cli.picture import TeamResults, draw_first_episodes
-from policy_pkg.checkpoint import CHECKPOINTS, load_policy
+from policy_pkg.checkpoint import AGENT, CHECKPOINTS, MANIFEST, load_policy
 from policy_pkg.train.evaluate import Condition, Evaluation, crash_free, evaluate, named
 from policy_pkg.train.run_dir import METRICS, RUN
 from policy_pkg.train.statistics import bootstrap_interquartile_mean, wilson
 
 SCENARIO = "buttons"
 CONDITIONS = (crash_free(), named(["robot_1"], "stay"), named(["robot_2"], "stay"))
-AGENT_FILES = ("agent.safetensors", "checkpoint.json")
-COLOURS = ("#d1495b", "#00798c")
+AGENT_FILES = (f"{AGENT}.safetensors", MANIFEST)
+COLOURS = {"qmix": "#d1495b", "adaptive": "#00798c"}  # of the methods that are drawn
 app = typer.Typer(add_completion=False, no_args_is_help=True)
 
 
@@ -65,6 +65,9 @@ def report(
         runs.setdefault(method, {})[int(seed)] = path.parent
     if not runs:
         raise typer.BadParameter(f"{results}: no run named METHOD-sSEED; `collect` makes them")
+    drawn = [(m, c) for m, c in COLOURS.items() if figure_seed in runs.get(m, {})]
+    if not drawn:
+        raise typer.BadParameter(f"--figure-seed {figure_seed}: no run of {' or '.join(COLOURS)}")
     out.mkdir(parents=True, exist_ok=True)
     played = {
         method: {seed: _evaluate(run) for seed, run in seeds.items()}
@@ -76,9 +79,8 @@ def report(
     (out / "table.md").write_text(table)
     typer.echo(table)
     teams = [
-        _team(method, runs[method][figure_seed], played[method][figure_seed], colour)
-        for method, colour in zip(("qmix", "adaptive"), COLOURS, strict=True)
-        if figure_seed in runs.get(method, {})
+        TeamResults(m, colour, load_policy(runs[m][figure_seed]), played[m][figure_seed])
+        for m, colour in drawn
     ]
     draw_first_episodes(teams, SCENARIO, out / "trajectories.png")
 
@@ -87,12 +89,6 @@ def _evaluate(run: Path) -> list[tuple[Condition, Evaluation]]:
     """One episode per condition: starts, buttons and greedy policies are deterministic."""
     bundle = load_policy(run)
     return [(c, evaluate(bundle, SCENARIO, c, episodes=1, seed=0)) for c in CONDITIONS]
-
-
-def _team(
-    method: str, run: Path, played: Sequence[tuple[Condition, Evaluation]], colour: str
-) -> TeamResults:
-    return TeamResults(method, colour, load_policy(run), played)
 
 
 def _row(
