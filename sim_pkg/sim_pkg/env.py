@@ -164,6 +164,7 @@ class Env:
         for _ in range(self._advances):
             self._scenario.command(running, actions, self._world)
             self._world.advance(running)
+        out.clear_outcome()
         self._scenario.settle(running, self._world, out)
         running &= ~(out.terminated | out.truncated)
         return self._result

@@ -72,6 +72,11 @@ class Buffers:
             hits=np.zeros((b, n_discs, n_discs), dtype=np.float32),
         )
 
+    def clear_outcome(self) -> None:
+        """Reward 0 and no flag in every arena."""
+        for array in (self.reward, self.terminated, self.truncated, self.success):
+            array.fill(0)
+
 
 class Scenario(Protocol):
     """The rules of one task over B arenas.
@@ -105,8 +110,8 @@ class Scenario(Protocol):
         ...
 
     def settle(self, running: BoolArray, world: World, out: Buffers) -> None:
-        """After the physics: fills reward and flags of every arena (0 and False where it does
-        not run), then observes."""
+        """After the physics: fills reward and flags, which are cleared, of the running arenas,
+        then observes."""
         ...
 
 

@@ -220,9 +220,6 @@ def _read_cells(running, bodies, rows, columns, cell_m, cells):  # type: ignore[
 @njit(cache=True)
 def _score(running, cells, buttons, touched, steps, limit, rewards, reward, terminated, success):  # type: ignore[no-untyped-def]
     for b in range(cells.shape[0]):
-        reward[b] = 0.0
-        terminated[b] = False
-        success[b] = False
         if not running[b]:
             continue
         steps[b] += 1

@@ -136,9 +136,6 @@ def _score(  # type: ignore[no-untyped-def]
     reward_step, reward, terminated, success,
 ):  # fmt: skip
     for b in range(len(running)):
-        reward[b] = 0.0
-        terminated[b] = False
-        success[b] = False
         if not running[b]:
             continue
         steps[b] += 1

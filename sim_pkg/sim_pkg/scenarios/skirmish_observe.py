@@ -42,9 +42,6 @@ def score(  # type: ignore[no-untyped-def]
     """Reward and end of every arena's step. ``full``: the rewards of a win before scaling."""
     d = whole.shape[1]
     for b in range(whole.shape[0]):
-        reward[b] = 0.0
-        terminated[b] = False
-        success[b] = False
         if not running[b]:
             continue
         steps[b] += 1
