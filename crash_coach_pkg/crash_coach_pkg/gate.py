@@ -1,7 +1,6 @@
-"""Applies faults to commands: one path for rollouts, evaluation and the gate node.
+"""Faults of whole batches of commands: the fast path of training for mute and random.
 
-Random actions come from a counter-based generator keyed by (seed, episode, step, robot), so
-neither arrival order nor batching can change them.
+TeamFaults does the same for one robot-step and every mode; a test holds the two together.
 """
 
 from __future__ import annotations
@@ -9,32 +8,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from crash_coach_pkg.plan import Mode
+from crash_coach_pkg.bits import UInt64Array, random_bits
 from sim_pkg.contract import BoolArray, EpisodeArray, IntArray
 
-UInt64Array = npt.NDArray[np.uint64]
-
-_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
-_MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
-_MIX_2 = np.uint64(0x94D049BB133111EB)
-
-
-def _splitmix64(x: UInt64Array) -> UInt64Array:
-    """The finaliser of SplitMix64 (Steele, Lea, Flood 2014), element by element."""
-    x = x + _GOLDEN
-    x = (x ^ (x >> np.uint64(30))) * _MIX_1
-    x = (x ^ (x >> np.uint64(27))) * _MIX_2
-    return x ^ (x >> np.uint64(31))
-
-
-def random_bits(
-    seed: int, episode: npt.ArrayLike, step: npt.ArrayLike, robot: npt.ArrayLike
-) -> UInt64Array:
-    """64 uniform bits for each (episode, step, robot); these broadcast together, at least 1-d."""
-    key = _splitmix64(np.atleast_1d(np.uint64(seed)))
-    for counter in (episode, step, robot):
-        key = _splitmix64(key ^ np.asarray(counter).astype(np.uint64))
-    return key
+MUTE_CODE = 1
+RANDOM_CODE = 2
 
 
 def random_available(bits: UInt64Array, available: BoolArray) -> IntArray:
@@ -59,7 +37,7 @@ def apply_faults(
 
     Args:
         intent: (B, n) what the policies want.
-        modes: (B, n) Mode in force.
+        modes: (B, n) code of the fault in force: 0, MUTE_CODE or RANDOM_CODE.
         available: (B, n, A).
         stay: (B, n) the no-move action of each robot: what a muted robot executes.
         seed, episode, step: keys of the random actions; episode and step are (B,).
@@ -67,8 +45,8 @@ def apply_faults(
     Returns:
         (B, n) int32.
     """
-    applied = np.where(modes == Mode.MUTE, stay, intent)
-    randomised = modes == Mode.RANDOM
+    applied = np.where(modes == MUTE_CODE, stay, intent)
+    randomised = modes == RANDOM_CODE
     if randomised.any():
         robots = np.arange(intent.shape[1], dtype=np.int32)[None, :]
         bits = random_bits(seed, episode[:, None], step[:, None], robots)

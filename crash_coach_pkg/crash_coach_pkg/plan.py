@@ -1,54 +1,74 @@
-"""The crash plan: who is faulted in an episode, from when, for how long, and how."""
+"""The crash plan: who is faulted in an episode, when, for how long, and how."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
-import numpy as np
-import numpy.typing as npt
-
 NEXT_STEP = 0xFFFFFFFF
 """A start step that the gate resolves to the first step it has not relayed anything of."""
 
 
-class Mode(IntEnum):
-    """What happens to a robot's command; the values are Action.fault's on the wire."""
+class TriggerKind(IntEnum):
+    """What starts a fault at or after its start step; the values are Fault.trigger's on the wire.
 
-    NONE = 0
-    MUTE = 1  # no command arrives, the robot stays
-    RANDOM = 2  # a uniform available action instead
+    Every trigger but HAZARD fires once per episode.
+    """
+
+    STEP = 0  # the start step itself; no values
+    HAZARD = 1  # (p,): at each step with probability p, and again after a recovery
+    NEAR = 2  # (x_m, y_m, radius_m): the robot is within the radius of the point (map frame)
+    RETURN_ABOVE = 3  # (x,): the episode's undiscounted return so far exceeds x
 
 
-MODE_NAMES = {"mute": Mode.MUTE, "stay": Mode.MUTE, "random": Mode.RANDOM}
-"""Accepted spellings; ``stay`` is the paper's word for ``mute``."""
+TRIGGER_VALUES = {
+    TriggerKind.STEP: 0,
+    TriggerKind.HAZARD: 1,
+    TriggerKind.NEAR: 3,
+    TriggerKind.RETURN_ABOVE: 1,
+}
 
 
-def parse_mode(name: str) -> Mode:
-    """Raises ValueError naming the accepted modes."""
-    try:
-        return MODE_NAMES[name]
-    except KeyError:
-        known = ", ".join(sorted(MODE_NAMES))
-        raise ValueError(f"unknown crash mode {name!r}; one of: {known}") from None
+@dataclass(frozen=True)
+class Trigger:
+    """Raises ValueError for a number of values that does not fit the kind."""
+
+    kind: TriggerKind = TriggerKind.STEP
+    values: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        wanted = TRIGGER_VALUES[self.kind]
+        if len(self.values) != wanted:
+            raise ValueError(
+                f"trigger {self.kind.name} has {len(self.values)} values, not {wanted}"
+            )
+
+    @property
+    def needs_world(self) -> bool:
+        """Whether it looks at positions or the return."""
+        return self.kind in (TriggerKind.NEAR, TriggerKind.RETURN_ABOVE)
+
+
+AT_START_STEP = Trigger()
 
 
 @dataclass(frozen=True)
 class Fault:
     robot: int  # index into the team
-    mode: Mode
+    mode: str  # a name that crash_coach_pkg.faults knows
     start_step: int = 0
     duration_steps: int = 0  # 0: until the episode ends
-
-    def covers(self, step: int) -> bool:
-        if step < self.start_step:
-            return False
-        return self.duration_steps == 0 or step < self.start_step + self.duration_steps
+    parameters: tuple[tuple[str, float], ...] = ()  # of the mode; what is missing has its default
+    trigger: Trigger = AT_START_STEP
+    entry: int = 0  # which entry of a fault scenario it comes from
 
 
 @dataclass(frozen=True)
 class CrashPlan:
-    """One episode's faults. ``seed`` keys random actions with (episode, step, robot)."""
+    """One episode's faults. ``seed`` keys everything random with (episode, step, robot).
+
+    ``cap``: most robots that may be faulted together; triggers that would exceed it wait.
+    """
 
     episode: int
     revision: int
@@ -56,21 +76,6 @@ class CrashPlan:
     rate: float
     cap: int
     faults: tuple[Fault, ...] = ()
-
-    def modes_at(self, step: int, n_robots: int) -> npt.NDArray[np.uint8]:
-        """(n,) Mode of each robot at ``step``; the last matching fault counts."""
-        modes = np.zeros(n_robots, dtype=np.uint8)
-        for fault in self.faults:
-            if fault.covers(step):
-                modes[fault.robot] = fault.mode
-        return modes
-
-    def mode_of(self, step: int, robot: int) -> Mode:
-        """Mode of one robot at ``step``, as in modes_at."""
-        for fault in reversed(self.faults):
-            if fault.robot == robot and fault.covers(step):
-                return fault.mode
-        return Mode.NONE
 
     def resolved(self, next_step: int) -> CrashPlan:
         """The same plan with every NEXT_STEP replaced."""

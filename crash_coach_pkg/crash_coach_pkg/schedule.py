@@ -1,0 +1,100 @@
+"""When each fault of a plan is in force: steps, durations, hazards and conditions."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from crash_coach_pkg.bits import random_bits
+from crash_coach_pkg.plan import CrashPlan, Fault, TriggerKind
+from sim_pkg.contract import FloatArray
+
+_HAZARD_STREAM = 1000  # + the fault's place in the plan
+_NEVER = -1
+
+
+class World(NamedTuple):
+    """What conditions look at, before the control step."""
+
+    positions_m: FloatArray  # (n, 2), map frame
+    episode_return: float  # undiscounted, so far
+
+
+class Schedule:
+    """Follows one episode under one plan; ``enter`` is called for steps in ascending order.
+
+    A plan may start to govern in mid-episode: hazards are drawn from ``first_step`` on.
+    """
+
+    def __init__(self, plan: CrashPlan, first_step: int = 0) -> None:
+        self._plan = plan
+        self._next = first_step
+        # Step at which the running stretch of each fault began.
+        self._since = [_NEVER] * len(plan.faults)
+        self._fired = [False] * len(plan.faults)
+        self.needs_world = any(fault.trigger.needs_world for fault in plan.faults)
+        self.in_force: tuple[int, ...] = ()
+        """Places in the plan of the faults in force at the step last entered, ascending."""
+
+    @property
+    def step(self) -> int:
+        """The step last entered; first_step - 1 before."""
+        return self._next - 1
+
+    def enter(self, step: int, world: World | None) -> None:
+        """Goes on to ``step``; steps that were skipped count for hazards and durations.
+
+        Raises:
+            ValueError: a step that was entered before, or conditions without a world.
+        """
+        if step < self._next:
+            raise ValueError(f"step {step} comes after step {self._next - 1}")
+        if self.needs_world and world is None:
+            raise ValueError(f"step {step}: the plan has conditions, but there is no world")
+        for passed in range(self._next, step + 1):
+            self._pass(passed, world if passed == step else None)
+        self._next = step + 1
+        self.in_force = tuple(i for i, since in enumerate(self._since) if since != _NEVER)
+
+    def _pass(self, step: int, world: World | None) -> None:
+        faults = self._plan.faults
+        for place, fault in enumerate(faults):
+            since = self._since[place]
+            if since != _NEVER and fault.duration_steps and step >= since + fault.duration_steps:
+                self._since[place] = _NEVER
+        for place, fault in enumerate(faults):
+            if self._since[place] == _NEVER and self._starts(place, fault, step, world):
+                self._fired[place] = True
+                self._since[place] = (
+                    fault.start_step if fault.trigger.kind == TriggerKind.STEP else step
+                )
+
+    def _starts(self, place: int, fault: Fault, step: int, world: World | None) -> bool:
+        if step < fault.start_step:
+            return False
+        kind = fault.trigger.kind
+        if kind == TriggerKind.STEP:
+            end = fault.start_step + fault.duration_steps
+            return not fault.duration_steps or step < end
+        if kind != TriggerKind.HAZARD and self._fired[place]:
+            return False
+        return self._triggered(place, fault, step, world) and self._room_for(fault.robot)
+
+    def _triggered(self, place: int, fault: Fault, step: int, world: World | None) -> bool:
+        values = fault.trigger.values
+        if fault.trigger.kind == TriggerKind.HAZARD:
+            plan = self._plan
+            stream = _HAZARD_STREAM + place
+            bits = random_bits(plan.seed, plan.episode, step, fault.robot, stream)
+            return (int(bits[0]) >> 11) * 2.0**-53 < values[0]
+        if world is None:  # a step that was skipped
+            return False
+        if fault.trigger.kind == TriggerKind.RETURN_ABOVE:
+            return world.episode_return > values[0]
+        x_m, y_m = (float(v) for v in world.positions_m[fault.robot])
+        return (x_m - values[0]) ** 2 + (y_m - values[1]) ** 2 <= values[2] ** 2
+
+    def _room_for(self, robot: int) -> bool:
+        """Whether one more robot may be faulted."""
+        faults = self._plan.faults
+        faulted = {faults[i].robot for i, since in enumerate(self._since) if since != _NEVER}
+        return robot in faulted or len(faulted) < self._plan.cap
