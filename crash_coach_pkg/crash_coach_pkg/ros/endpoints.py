@@ -1,0 +1,95 @@
+"""Who is at the other end of a topic: publishers beside our own, and the QoS that they offer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+
+class Endpoint(NamedTuple):
+    """A publisher on the graph. ``gid`` is unique, ``node`` (with namespace) need not be."""
+
+    gid: str
+    node: str
+
+    def __str__(self) -> str:
+        return f"{self.node} (gid {self.gid})"
+
+
+class Sighting(NamedTuple):
+    """What changed since the look before."""
+
+    appeared: tuple[Endpoint, ...]
+    gone: tuple[Endpoint, ...]
+
+
+def publishers_on(node: Node, topic: str) -> frozenset[Endpoint]:
+    """Every publisher on ``topic`` that the graph knows of now."""
+    return frozenset(
+        Endpoint(
+            bytes(info.endpoint_gid).hex(),
+            f"{info.node_namespace.rstrip('/')}/{info.node_name}",
+        )
+        for info in node.get_publishers_info_by_topic(topic)
+    )
+
+
+class WatchedPublisher:
+    """A publisher of ours, and who else publishes on its topic.
+
+    Ours is known by its gid: a second gate of the same name is an intruder as well.
+    """
+
+    def __init__(self, node: Node, type_: type, topic: str, qos: QoSProfile) -> None:
+        self._node = node
+        before = publishers_on(node, topic)
+        self._publisher = node.create_publisher(type_, topic, qos)
+        name = node.get_fully_qualified_name()
+        # rclpy does not tell a publisher's gid. Our own is on the graph at once, others only
+        # after their discovery.
+        self._own = {e.gid for e in publishers_on(node, topic) - before if e.node == name}
+        self._seen: frozenset[Endpoint] = frozenset()
+        self.topic: str = self._publisher.topic_name
+        self.publish = self._publisher.publish
+        """A message, or its serialized bytes."""
+
+    @property
+    def intruders(self) -> tuple[Endpoint, ...]:
+        """As of the last look, in a fixed order."""
+        return tuple(sorted(self._seen))
+
+    def look(self) -> Sighting:
+        """Asks the graph; call at a low rate."""
+        found = publishers_on(self._node, self.topic)
+        now = frozenset(e for e in found if e.gid not in self._own)
+        sighting = Sighting(tuple(sorted(now - self._seen)), tuple(sorted(self._seen - now)))
+        self._seen = now
+        return sighting
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """The strongest service that every publisher on a topic offers."""
+
+    reliability: ReliabilityPolicy
+    durability: DurabilityPolicy
+
+    def request(self, depth: int) -> QoSProfile:
+        """A subscription that matches them all."""
+        return QoSProfile(depth=depth, reliability=self.reliability, durability=self.durability)
+
+
+def offered(node: Node, topic: str) -> Offer | None:
+    """What to subscribe to ``topic`` with; None while nobody publishes on it."""
+    profiles: list[Any] = [info.qos_profile for info in node.get_publishers_info_by_topic(topic)]
+    if not profiles:
+        return None
+    reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
+    lasting = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
+    return Offer(
+        ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        DurabilityPolicy.TRANSIENT_LOCAL if lasting else DurabilityPolicy.VOLATILE,
+    )
