@@ -143,6 +143,18 @@ class TeamFaults(Generic[C]):
             self.last[robot] = passed
         return Effect(stretch.fault.mode, stretch.fault.entry, passed)
 
+    def idle(self, robot: int) -> Effect[C]:
+        """What ``robot`` gets in the step entered before any command came in it."""
+        stretch = self._commands.get(robot)
+        if stretch is None:
+            return Effect("", 0, None)
+        made = stretch.made
+        assert isinstance(made, CommandFault)
+        passed = made.idle(self._step(robot))
+        if passed is not None:
+            self.last[robot] = passed
+        return Effect(stretch.fault.mode, stretch.fault.entry, passed)
+
     def observation(self, robot: int, features: FloatArray) -> FloatArray:
         """(O,) what ``robot``'s policy sees in the step entered; ``features`` itself, or new."""
         stretch = self._observations.get(robot)

@@ -103,6 +103,14 @@ class CommandFault(FaultMode, ABC, Generic[C]):
         """
         ...
 
+    def idle(self, step: Step) -> C | None:
+        """What is passed on in a step without a command so far; None: nothing.
+
+        Only streams that are not in lock-step have such steps (the relay gate's ticks); a command
+        of the same step may still follow. Whatever goes out here must not go out again.
+        """
+        return None
+
 
 class ObservationFault(FaultMode, ABC):
     """Changes what the policy sees; the robot itself, and the mask of actions, are untouched."""
