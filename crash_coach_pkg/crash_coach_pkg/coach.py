@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
-from crash_coach_pkg.config import CoachConfig, check_team
-from crash_coach_pkg.plan import CrashPlan, Fault, parse_mode
-from crash_coach_pkg.sampling import crash_cap, draw_exactly, draw_mask, episode_rng
+from crash_coach_pkg.config import CoachConfig, TeamSpec
+from crash_coach_pkg.draws import among, check_team, draw_faults, draw_victims, most_crashed
+from crash_coach_pkg.plan import CrashPlan
+from crash_coach_pkg.sampling import crash_cap, draw_mask, episode_rng
 from crash_coach_pkg.strategies import Progress, make_strategy
 from sim_pkg.contract import BoolArray, UserError
 
 JsonScalar = int | float
 Decision = Literal["raise", "lower", "keep"]
+
+
+class Planner(Protocol):
+    """What decides the faults of each episode: a Coach, or a fault scenario's planner."""
+
+    def plan(self, episode: int) -> CrashPlan:
+        """Of ``episode``: the same whenever, and in whatever order, it is asked for."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -23,7 +32,7 @@ class BlockRecord:
 
     rate: float  # alpha_t, in force up to this block
     cap: int
-    crashed_fraction: float | None  # realised; None: no episode was counted
+    crashed_fraction: float | None  # of the candidates, as planned; None: no episode was counted
     episodes: int  # counted for crashed_fraction
     success_rate: float  # e_t
     decision: Decision
@@ -35,22 +44,22 @@ class Coach:
 
     Args:
         config: the settings.
-        robots: names of the team, in robot order.
+        team: whom it plans for.
         seed: keys every draw together with the episode, and the random actions of the plans.
 
     Raises:
         UserError: settings that this team cannot keep, or a negative seed.
     """
 
-    def __init__(self, config: CoachConfig, robots: tuple[str, ...], seed: int) -> None:
-        check_team(config, robots)
+    def __init__(self, config: CoachConfig, team: TeamSpec, seed: int) -> None:
+        check_team(config, team)
         if not 0 <= seed < 2**63:
             raise UserError(f"seed {seed} is not in 0..2^63-1")
         self._config = config
-        self._robots = robots
+        self._team = team
+        self._candidates = team.of_role(config.victim_role)
         self._seed = seed
         self._strategy = make_strategy(config)
-        self._mode = parse_mode(config.crash_mode)
         self._rate = self._strategy.initial_rate
         self._revision = 0
         self._episodes = 0
@@ -61,8 +70,8 @@ class Coach:
         return self._config
 
     @property
-    def robots(self) -> tuple[str, ...]:
-        return self._robots
+    def team(self) -> TeamSpec:
+        return self._team
 
     @property
     def rate(self) -> float:
@@ -78,7 +87,7 @@ class Coach:
         Raises:
             UserError: as the constructor.
         """
-        coach = Coach(config, self._robots, seed)
+        coach = Coach(config, self._team, seed)
         coach._revision = self._revision + 1
         same = config.strategy == self._config.strategy
         if same and coach._rate == self._strategy.initial_rate:
@@ -94,29 +103,37 @@ class Coach:
 
     @property
     def cap(self) -> int:
-        """Most robots that may crash together at the present rate."""
-        c, n = self._config, len(self._robots)
-        return crash_cap(c.cap_rule, n, self._rate, c.max_crashed, c.min_alive, c.resample)
+        """Most robots that a draw at the present rate may crash."""
+        c, n = self._config, len(self._candidates)
+        limit = most_crashed(c, self._team.n)
+        return crash_cap(c.cap_rule, n, self._rate, limit, c.resample)
 
     def plan(self, episode: int) -> CrashPlan:
         """The crashes of ``episode``: the same for the same (config, rate, seed, episode)."""
         mask, cap = self._mask(episode)
-        faults = tuple(
-            Fault(int(robot), self._mode, self._config.start_step, self._config.duration_steps)
-            for robot in np.flatnonzero(mask)
-        )
+        faults = draw_faults(self._config, self._team, mask)
         return CrashPlan(episode, self._revision, self._seed, self._rate, cap, faults)
 
     def _mask(self, episode: int) -> tuple[BoolArray, int]:
-        config, n = self._config, len(self._robots)
+        """(n,) victims, and how many may be faulted together."""
+        config, n = self._config, self._team.n
         if config.strategy == "none":
             return np.zeros(n, dtype=np.bool_), 0
-        if config.victims:
-            return np.array([name in config.victims for name in self._robots]), len(config.victims)
         rng = episode_rng(self._seed, episode)
-        if config.crashed_exactly >= 0:
-            return draw_exactly(rng, n, config.crashed_exactly), config.crashed_exactly
-        return draw_mask(rng, n, self._rate, self.cap), self.cap
+        by_rate = not self._everybody and not config.victims and config.crashed_exactly < 0
+        if by_rate:
+            drawn = draw_mask(rng, len(self._candidates), self._rate, self.cap)
+            mask, cap = among(self._candidates, n, drawn), self.cap
+        else:
+            mask = draw_victims(config, self._team, rng)
+            cap = int(mask.sum())
+        return mask, most_crashed(config, n) if config.triggered else cap
+
+    @property
+    def _everybody(self) -> bool:
+        """Whether a hazard or condition chooses among all candidates, without a draw before it."""
+        config = self._config
+        return config.triggered and config.strategy == "fixed" and config.crash_rate == 0
 
     def count(self, plan: CrashPlan) -> None:
         """Counts a training episode towards the realised crash fraction of the block."""
@@ -136,7 +153,7 @@ class Coach:
         if not 0 <= success_rate <= 1:
             raise ValueError(f"success rate {success_rate} is not in [0, 1]")
         old, cap, episodes = self._rate, self.cap, self._episodes
-        fraction = self._crashed / (episodes * len(self._robots)) if episodes else None
+        fraction = self._crashed / (episodes * len(self._candidates)) if episodes else None
         self._set_rate(self._strategy.next_rate(old, success_rate, progress))
         self._episodes = self._crashed = 0
         decision: Decision = (

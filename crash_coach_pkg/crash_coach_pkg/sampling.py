@@ -23,16 +23,12 @@ def episode_rng(seed: int, episode: int) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(key=key))
 
 
-def crash_cap(
-    rule: CapRule, n: int, rate: float, max_crashed: int, min_alive: int, resample: bool
-) -> int:
+def crash_cap(rule: CapRule, n: int, rate: float, limit: int, resample: bool) -> int:
     """Most robots of n that may crash together at ``rate``.
 
-    ``max_crashed`` (-1: none) and ``min_alive`` limit it always, ``rule`` only with ``resample``.
+    ``limit`` holds always, ``rule`` only with ``resample``.
     """
-    cap = n - min_alive
-    if max_crashed >= 0:
-        cap = min(cap, max_crashed)
+    cap = min(n, limit)
     if resample:
         cap = min(cap, _rule_cap(rule, n, rate))
     return max(0, cap)
