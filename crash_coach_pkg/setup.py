@@ -10,7 +10,7 @@ setup(
     maintainer_email="team@crash-coach.dev",
     license="Apache-2.0",
     packages=["crash_coach_pkg", "crash_coach_pkg.faults", "crash_coach_pkg.ros"],
-    package_data={},
+    package_data={"crash_coach_pkg": ["configs/**/*.yaml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
         (f"share/{package}", ["package.xml"]),
