@@ -67,7 +67,8 @@ class Fault:
 class CrashPlan:
     """One episode's faults. ``seed`` keys everything random with (episode, step, robot).
 
-    ``cap``: most robots that may be faulted together; triggers that would exceed it wait.
+    ``cap``: most robots that may be faulted together; triggers that would exceed it wait, also
+    where they would leave no room for a fault with a start step of its own.
     """
 
     episode: int

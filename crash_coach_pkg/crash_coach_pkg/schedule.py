@@ -32,8 +32,11 @@ class Schedule:
         self._since = [_NEVER] * len(plan.faults)
         self._fired = [False] * len(plan.faults)
         self.needs_world = any(fault.trigger.needs_world for fault in plan.faults)
-        self.in_force: tuple[int, ...] = ()
-        """Places in the plan of the faults in force at the step last entered, ascending."""
+        self.in_force: dict[int, int] = {}
+        """Of the faults in force at the step last entered: place in the plan -> first step.
+
+        Ascending places. A fault whose time was over and that began again has another first step.
+        """
 
     @property
     def step(self) -> int:
@@ -53,7 +56,7 @@ class Schedule:
         for passed in range(self._next, step + 1):
             self._pass(passed, world if passed == step else None)
         self._next = step + 1
-        self.in_force = tuple(i for i, since in enumerate(self._since) if since != _NEVER)
+        self.in_force = {i: since for i, since in enumerate(self._since) if since != _NEVER}
 
     def _pass(self, step: int, world: World | None) -> None:
         faults = self._plan.faults
@@ -77,7 +80,7 @@ class Schedule:
             return not fault.duration_steps or step < end
         if kind != TriggerKind.HAZARD and self._fired[place]:
             return False
-        return self._triggered(place, fault, step, world) and self._room_for(fault.robot)
+        return self._triggered(place, fault, step, world) and self._room_for(fault, step)
 
     def _triggered(self, place: int, fault: Fault, step: int, world: World | None) -> bool:
         values = fault.trigger.values
@@ -93,8 +96,22 @@ class Schedule:
         x_m, y_m = (float(v) for v in world.positions_m[fault.robot])
         return (x_m - values[0]) ** 2 + (y_m - values[1]) ** 2 <= values[2] ** 2
 
-    def _room_for(self, robot: int) -> bool:
-        """Whether one more robot may be faulted."""
-        faults = self._plan.faults
-        faulted = {faults[i].robot for i, since in enumerate(self._since) if since != _NEVER}
-        return robot in faulted or len(faulted) < self._plan.cap
+    def _room_for(self, fault: Fault, step: int) -> bool:
+        """Whether ``fault`` may begin: the cap holds in all of its time.
+
+        Room is kept for the robots whose start step lies within it, so that these never wait.
+        """
+        others = {
+            other.robot
+            for place, other in enumerate(self._plan.faults)
+            if other.robot != fault.robot
+            and (self._since[place] != _NEVER or _comes_within(other, fault, step))
+        }
+        return len(others) < self._plan.cap
+
+
+def _comes_within(other: Fault, fault: Fault, step: int) -> bool:
+    """Whether ``other`` starts by its start step while ``fault``, begun at ``step``, lasts."""
+    if other.trigger.kind != TriggerKind.STEP or other.start_step <= step:
+        return False
+    return not fault.duration_steps or other.start_step < step + fault.duration_steps

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple
 
-from crash_coach_pkg.faults import make_fault
+from crash_coach_pkg.faults import check_parameters, is_observation_mode, make_fault
 from crash_coach_pkg.faults.base import C, CommandFault, Need, ObservationFault, Step, Tools
 from crash_coach_pkg.plan import CrashPlan, Fault
 from crash_coach_pkg.schedule import Schedule, World
@@ -35,6 +35,7 @@ class Change:
 
     began: bool
     step: int
+    mode: str  # its name, where the plan has a synonym
     fault: Fault
 
 
@@ -43,12 +44,20 @@ class _Stretch:
     """A fault in force, and the object that carries it out."""
 
     fault: Fault
+    since: int
     made: CommandFault[Any] | ObservationFault
+
+    def change(self, began: bool, step: int) -> Change:
+        return Change(began, step, self.made.name, self.fault)
 
 
 class TeamFaults(Generic[C]):
     """Args: ``last``: what was last passed on to each robot in this episode, where a plan takes
-    over from another in mid-episode; likewise ``last_seen`` of its observations."""
+    over from another in mid-episode; likewise ``last_seen`` of its observations.
+
+    Raises:
+        UserError: an unknown mode, or parameters that it does not take.
+    """
 
     def __init__(
         self,
@@ -63,6 +72,10 @@ class TeamFaults(Generic[C]):
         self.last_seen: list[FloatArray | None] = (
             [None] * n_robots if last_seen is None else list(last_seen)
         )
+        for fault in plan.faults:
+            check_parameters(fault.mode, dict(fault.parameters))
+        # Whether what policies see must be kept: the arrays are the caller's buffers.
+        self._watches = any(is_observation_mode(fault.mode) for fault in plan.faults)
         self._schedule = Schedule(plan, first_step)
         self._stretches: dict[int, _Stretch] = {}  # by place in the plan
         self._commands: dict[int, _Stretch] = {}  # by robot: the last one of the plan counts
@@ -88,15 +101,14 @@ class TeamFaults(Generic[C]):
             return []
         self._schedule.enter(step, world)
         in_force = self._schedule.in_force
-        changes = []
-        for place in [place for place in self._stretches if place not in in_force]:
-            changes.append(Change(False, step, self._stretches.pop(place).fault))
-        for place in in_force:
+        over = [p for p, s in self._stretches.items() if in_force.get(p) != s.since]
+        changes = [self._stretches.pop(place).change(False, step) for place in over]
+        for place, since in in_force.items():
             if place not in self._stretches:
                 fault = self.plan.faults[place]
                 made = make_fault(fault.mode, dict(fault.parameters))
-                self._stretches[place] = _Stretch(fault, made)
-                changes.append(Change(True, step, fault))
+                stretch = self._stretches[place] = _Stretch(fault, since, made)
+                changes.append(stretch.change(True, step))
         if changes:
             self._sort_out()
         return changes
@@ -117,8 +129,19 @@ class TeamFaults(Generic[C]):
 
     def mode(self, robot: int) -> str:
         """Of the fault in force: the command's, or else the observation's; '' without."""
-        stretch = self._commands.get(robot) or self._observations.get(robot)
-        return stretch.fault.mode if stretch is not None else ""
+        return self.command_mode(robot) or self.observation_mode(robot)
+
+    def command_mode(self, robot: int) -> str:
+        """Of the command fault in force on ``robot``; '' without."""
+        return _mode(self._commands.get(robot))
+
+    def observation_mode(self, robot: int) -> str:
+        """Of the observation fault in force on ``robot``; '' without."""
+        return _mode(self._observations.get(robot))
+
+    def observation_entry(self, robot: int) -> int:
+        """Of the observation fault in force on ``robot``; 0 without."""
+        return _entry(self._observations.get(robot))
 
     @property
     def faulted(self) -> frozenset[int]:
@@ -131,9 +154,7 @@ class TeamFaults(Generic[C]):
         if stretch is None:
             self.last[robot] = command
             seen = self._observations.get(robot)
-            if seen is None:
-                return Effect("", 0, command)
-            return Effect(seen.fault.mode, seen.fault.entry, command)
+            return Effect(_mode(seen), _entry(seen), command)
         made = stretch.made
         assert isinstance(made, CommandFault)
         passed = made.apply(self._step(robot), command, self.last[robot], tools)
@@ -141,7 +162,7 @@ class TeamFaults(Generic[C]):
             passed = None
         if passed is not None:
             self.last[robot] = passed
-        return Effect(stretch.fault.mode, stretch.fault.entry, passed)
+        return Effect(made.name, stretch.fault.entry, passed)
 
     def idle(self, robot: int) -> Effect[C]:
         """What ``robot`` gets in the step entered before any command came in it."""
@@ -153,13 +174,13 @@ class TeamFaults(Generic[C]):
         passed = made.idle(self._step(robot))
         if passed is not None:
             self.last[robot] = passed
-        return Effect(stretch.fault.mode, stretch.fault.entry, passed)
+        return Effect(made.name, stretch.fault.entry, passed)
 
     def observation(self, robot: int, features: FloatArray) -> FloatArray:
         """(O,) what ``robot``'s policy sees in the step entered; ``features`` itself, or new."""
         stretch = self._observations.get(robot)
         if stretch is None:
-            self.last_seen[robot] = features
+            self.last_seen[robot] = features.copy() if self._watches else features
             return features
         made = stretch.made
         assert isinstance(made, ObservationFault)
@@ -167,10 +188,13 @@ class TeamFaults(Generic[C]):
         self.last_seen[robot] = seen
         return seen
 
-    def observation_mode(self, robot: int) -> str:
-        """Of the observation fault in force on ``robot``; '' without."""
-        stretch = self._observations.get(robot)
-        return stretch.fault.mode if stretch is not None else ""
-
     def _step(self, robot: int) -> Step:
         return Step(self.plan.seed, self.plan.episode, self._schedule.step, robot)
+
+
+def _mode(stretch: _Stretch | None) -> str:
+    return stretch.made.name if stretch is not None else ""
+
+
+def _entry(stretch: _Stretch | None) -> int:
+    return stretch.fault.entry if stretch is not None else 0

@@ -33,11 +33,13 @@ class EnvSpec:
 
     ``stay_actions`` are the scenario's no-move actions in order of preference; in every
     reachable situation at least one of them is available to every robot. ``bounds`` are the
-    lowest and highest value that any observation or state feature can take.
+    lowest and highest value that any observation or state feature can take. ``roles`` has one name
+    per robot: faults may be aimed at a role.
     """
 
     scenario: str
     robots: tuple[str, ...]
+    roles: tuple[str, ...]
     action_names: tuple[str, ...]
     stay_actions: tuple[int, ...]
     obs_size: int

@@ -2,22 +2,49 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 
 from pydantic import ValidationError
 
-from crash_coach_pkg.faults.base import CommandFault, FaultMode, FaultParameters, ObservationFault
+from crash_coach_pkg.faults.adversarial import Adversarial
+from crash_coach_pkg.faults.base import (
+    CommandFault,
+    FaultMode,
+    FaultParameters,
+    Need,
+    ObservationFault,
+)
+from crash_coach_pkg.faults.bias import Bias
+from crash_coach_pkg.faults.blind import Blind
+from crash_coach_pkg.faults.delay import Delay
+from crash_coach_pkg.faults.drop import Drop
 from crash_coach_pkg.faults.freeze import Freeze
 from crash_coach_pkg.faults.mute import Mute
+from crash_coach_pkg.faults.noise import Noise
 from crash_coach_pkg.faults.random import Random
+from crash_coach_pkg.faults.scale import Scale
+from crash_coach_pkg.faults.schema import parameters_of
+from crash_coach_pkg.faults.stale import Stale
 from sim_pkg.contract import UserError
 
 ENTRY_POINT_GROUP = "crash_coach.faults"
 SYNONYMS = {"stay": "mute"}
 """``stay`` is the paper's word for ``mute``."""
 
-_MODES: dict[str, type[FaultMode]] = {mode.name: mode for mode in (Mute, Random, Freeze)}
+_BUILT_IN: tuple[type[FaultMode], ...] = (
+    Mute, Random, Freeze, Delay, Drop, Bias, Scale, Adversarial, Blind, Stale, Noise,
+)  # fmt: skip
+_OWN_CODES = range(128, 256)
+_NEEDED = {
+    "availability": "which commands the robot can execute",
+    "sampler": "a way to draw random commands",
+    "worst": "the command that the policy values least",
+    "vector": "velocities (a Twist type)",
+}
+
+_modes: dict[str, type[FaultMode]] = {mode.name: mode for mode in _BUILT_IN}
 _installed_read = False
 
 
@@ -25,38 +52,71 @@ def register(mode: type[FaultMode]) -> None:
     """Makes a mode known to this process.
 
     Raises:
-        ValueError: its name or code is taken, or neither command nor observation fault.
+        ValueError: its name or code is taken or not allowed, a parameter without range, unit or
+            description, or neither a command nor an observation fault.
     """
-    if not issubclass(mode, CommandFault | ObservationFault):
-        raise ValueError(f"{mode.__name__} is neither a CommandFault nor an ObservationFault")
-    if not 1 <= mode.code <= 255:
-        raise ValueError(f"fault mode {mode.name!r}: code {mode.code} is not in 1..255")
-    for other in _MODES.values():
+    _check(mode, _known_modes())
+    _modes[mode.name] = mode
+
+
+def _check(mode: type[FaultMode], known: Mapping[str, type[FaultMode]]) -> None:
+    if not (isinstance(mode, type) and issubclass(mode, CommandFault | ObservationFault)):
+        raise ValueError(f"{mode!r} is neither a CommandFault nor an ObservationFault")
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", mode.name):
+        raise ValueError(f"fault mode {mode.name!r}: a name has lower-case letters, digits and _")
+    if mode.code not in _OWN_CODES:
+        raise ValueError(
+            f"fault mode {mode.name!r}: code {mode.code} is not in "
+            f"{_OWN_CODES.start}..{_OWN_CODES.stop - 1}"
+        )
+    for other in known.values():
         if mode.name in (other.name, *SYNONYMS) or mode.code == other.code:
             raise ValueError(
                 f"fault mode {mode.name!r} (code {mode.code}): name or code is taken by "
                 f"{other.name!r} (code {other.code})"
             )
-    _MODES[mode.name] = mode
+    parameters_of(mode)
 
 
-def _modes() -> dict[str, type[FaultMode]]:
+def _known_modes() -> dict[str, type[FaultMode]]:
     global _installed_read
     if not _installed_read:
-        _installed_read = True
+        found = dict(_modes)
         for point in entry_points(group=ENTRY_POINT_GROUP):
-            register(point.load())
-    return _MODES
+            mode = _load(point)
+            if mode in found.values():  # registered before
+                continue
+            try:
+                _check(mode, found)
+            except ValueError as error:
+                raise UserError(f"{_place(point)} cannot be used: {error}") from error
+            found[mode.name] = mode
+        _modes.update(found)
+        _installed_read = True
+    return _modes
+
+
+def _load(point: EntryPoint) -> type[FaultMode]:
+    try:
+        mode: type[FaultMode] = point.load()
+    except (ImportError, AttributeError) as error:
+        raise UserError(f"{_place(point)} cannot be loaded: {error}") from error
+    return mode
+
+
+def _place(point: EntryPoint) -> str:
+    package = point.dist.name if point.dist is not None else "an unknown package"
+    return f"entry point {point.name} = {point.value} ({ENTRY_POINT_GROUP}) of {package}"
 
 
 def mode_names() -> tuple[str, ...]:
     """Every known mode, in order of their codes."""
-    return tuple(mode.name for mode in sorted(_modes().values(), key=lambda m: m.code))
+    return tuple(mode.name for mode in sorted(_known_modes().values(), key=lambda m: m.code))
 
 
 def fault_mode(name: str) -> type[FaultMode]:
     """The mode of that name (or synonym). Raises UserError naming the known ones."""
-    modes = _modes()
+    modes = _known_modes()
     try:
         return modes[SYNONYMS.get(name, name)]
     except KeyError:
@@ -67,6 +127,23 @@ def fault_mode(name: str) -> type[FaultMode]:
 def mode_code(name: str) -> int:
     """0 for the empty name: no fault."""
     return fault_mode(name).code if name else 0
+
+
+def unmet_needs(mode: str, offered: frozenset[Need]) -> str | None:
+    """Why ``mode`` cannot act on commands that offer no more than this; None: it can.
+
+    Raises:
+        UserError: an unknown mode.
+    """
+    missing = [_NEEDED[need] for need in sorted(fault_mode(mode).needs - offered)]
+    if not missing:
+        return None
+    return f"crash mode {mode} needs {' and '.join(missing)}, which these commands do not offer"
+
+
+def is_observation_mode(mode: str) -> bool:
+    """Whether it changes what policies see. Raises UserError for an unknown mode."""
+    return issubclass(fault_mode(mode), ObservationFault)
 
 
 def check_parameters(mode: str, parameters: Mapping[str, float]) -> FaultParameters:

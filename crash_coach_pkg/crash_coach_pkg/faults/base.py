@@ -44,7 +44,10 @@ class Step:
     robot: int
 
     def bits(self, stream: int) -> int:
-        """64 uniform bits of this robot-step; ``stream`` > 0 separates different uses."""
+        """64 uniform bits of this robot-step; ``stream`` separates different uses.
+
+        Streams 0..99 are the built-in modes', 100..999 free for others, from 1000 the schedule's.
+        """
         return int(random_bits(self.seed, self.episode, self.step, self.robot, stream)[0])
 
     def uniform(self, stream: int) -> float:
@@ -81,7 +84,7 @@ class FaultMode:
 
     name: ClassVar[str]
     code: ClassVar[int]
-    """Of ``Action.fault`` and of recorded episodes: 1..127 are the built-in modes'."""
+    """Of ``Action.fault`` and of recorded episodes: 128..255; below are the built-in modes'."""
     summary: ClassVar[str]
     """One line for the docs: what happens to which topic."""
     Parameters: ClassVar[type[FaultParameters]] = FaultParameters

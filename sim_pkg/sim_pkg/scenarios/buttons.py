@@ -104,6 +104,7 @@ class Buttons:
         self.spec = EnvSpec(
             scenario=name,
             robots=robot_names(n),
+            roles=("robot",) * n,
             action_names=ACTIONS,
             stay_actions=(STAY,),
             obs_size=2,

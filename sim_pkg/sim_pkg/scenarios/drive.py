@@ -86,6 +86,7 @@ class DrivenConfig(StrictModel):
         return EnvSpec(
             scenario=name,
             robots=robot_names(len(self.starts)),
+            roles=("robot",) * len(self.starts),
             action_names=ACTIONS,
             stay_actions=(STAY,),
             obs_size=obs_size,

@@ -60,6 +60,7 @@ class Skirmish:
         self.spec = EnvSpec(
             scenario=name,
             robots=robot_names(self._n),
+            roles=tuple(placed.unit for placed in config.robots),
             action_names=layout.action_names,
             stay_actions=(STOP, NO_OP),
             obs_size=layout.obs_size,
