@@ -1,71 +1,33 @@
 """The gate's decisions, without ROS: the single arbiter of every robot-step.
 
-Every (episode, step, robot) is decided exactly once, by the plan that governs the step; a
-duplicate gets the same decision again. A plan governs from the first step of its episode that
-nothing was relayed of when it came. When the coach is silent for longer than its lease, every
-fault is cleared at once and commands pass untouched until a plan comes again.
+Every (episode, step, robot) is decided exactly once, by the plan that governs the step (PlanBook);
+a duplicate gets the same decision again. Where observations are relayed too, the same holds for
+each of them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from enum import IntEnum
-from typing import Any, NamedTuple
+from crash_coach_pkg.action_tools import UNTOLD, ActionTools
+from crash_coach_pkg.faults import check_parameters, fault_mode
+from crash_coach_pkg.faults.base import Need, ObservationFault
+from crash_coach_pkg.gate_types import (
+    OBSERVED,
+    WITHHELD,
+    Command,
+    Decision,
+    Outputs,
+    Seen,
+    Sight,
+)
+from crash_coach_pkg.plan import CrashPlan
+from crash_coach_pkg.plan_book import Event, EventKind, PlanBook, Term
+from crash_coach_pkg.robot_faults import RobotFaults, Worlds
+from crash_coach_pkg.schedule import World
+from crash_coach_pkg.team_faults import TeamFaults
+from sim_pkg.contract import BoolArray, UserError
 
-from crash_coach_pkg.gate import random_available, random_bits
-from crash_coach_pkg.plan import CrashPlan, Mode
-from sim_pkg.contract import BoolArray
-
-NOTHING_APPLIED = -1
-
-
-class EventKind(IntEnum):
-    """The values are FaultEvent's on the wire; EFFECT is a Decision whose mode is not NONE."""
-
-    ARMED = 0
-    CLEARED = 2
-    EXPIRED = 3
-
-
-class Command(NamedTuple):
-    """What a policy wants. ``token`` is the caller's own (its message) and is handed back.
-
-    A tuple, as Decision is: a frozen dataclass takes five times as long to make, and the gate
-    makes both for every robot-step.
-    """
-
-    robot: int
-    episode: int
-    step: int
-    action: int
-    token: Any = None
-
-    @property
-    def key(self) -> tuple[int, int]:
-        return (self.episode, self.step)
-
-
-class Decision(NamedTuple):
-    """What the robot gets: ``applied``, or no command where that is NOTHING_APPLIED."""
-
-    command: Command
-    mode: Mode
-    applied: int
-    revision: int
-    repeated: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Event:
-    """``step``: the first that the change governs."""
-
-    kind: EventKind
-    episode: int
-    step: int
-    revision: int
-
-
-Outputs = tuple[Decision | Event, ...]
+OFFERED: frozenset[Need] = frozenset(("availability", "sampler", "worst"))
+_FROM_OBSERVATION: frozenset[Need] = frozenset(("availability", "sampler"))
 
 
 class GateState:
@@ -73,93 +35,95 @@ class GateState:
 
     Args:
         n_robots: size of the team.
-        lockstep: hold commands of an episode until its plan is there, and commands under a
-            random fault until the observation of the same step is there. Otherwise nothing is
-            ever held: an episode without a plan has no faults, a random action is drawn from the
-            newest availability, and withheld where none was ever seen.
+        lockstep: hold commands (and observations) of an episode until its plan is there, and
+            those that a fault or condition needs more for until that of the same step is there.
+            Otherwise nothing is ever held: an episode without a plan has no faults, and the
+            newest availability and state count; what needs them and has none is withheld.
         first_lease_s: how long the first commands are held for a coach that never spoke.
+        relay_observations: whether policies see what this gate lets them; without, plans with
+            observation faults are refused.
     """
 
-    def __init__(self, n_robots: int, lockstep: bool, first_lease_s: float) -> None:
+    def __init__(
+        self,
+        n_robots: int,
+        lockstep: bool,
+        first_lease_s: float,
+        relay_observations: bool = False,
+    ) -> None:
         self._n = n_robots
         self._lockstep = lockstep
-        self._first_lease_s = first_lease_s
-        self._episode = -1  # of the schedule: the newest that anything was decided of
-        self._schedule: list[tuple[int, CrashPlan]] = []  # (first step governed, plan), ascending
-        self._pending: CrashPlan | None = None  # for a later episode
-        self._revision = 0
-        self._known = False  # a plan was accepted, and its lease has not run out
-        self._expired = False
-        self._deadline_s: float | None = None
+        self._relays = relay_observations
+        self.book = PlanBook(lockstep, first_lease_s, self._why_not)
+        self._commands = [RobotFaults(robot, n_robots, True) for robot in range(n_robots)]
+        self._sights = [RobotFaults(robot, n_robots, False) for robot in range(n_robots)]
         self._done: list[tuple[int, int]] = [(-1, -1)] * n_robots
         self._last: list[Decision | None] = [None] * n_robots
         self._held: list[Command | None] = [None] * n_robots
+        self._seen: list[Seen | None] = [None] * n_robots
+        self._held_sights: list[Sight | None] = [None] * n_robots
         self._masks: list[tuple[tuple[int, int], BoolArray] | None] = [None] * n_robots
+        self._worlds = Worlds(n_robots, lockstep)
         self.late = 0
         """Commands dropped because a newer one of the same robot or a newer episode came first."""
-        self.ignored_plans = 0
-        """Plans with an older revision or for an older episode."""
+        self.untold = [0] * n_robots
+        """Robot-steps under a fault that needs the worst action, which the policy did not tell."""
+
+    def last(self, robot: int) -> Decision | None:
+        """The newest decision on ``robot``."""
+        return self._last[robot]
 
     @property
-    def randomised_robots(self) -> frozenset[int]:
-        """Robots whose observations (availability) a plan at hand needs."""
-        plans = [plan for _, plan in self._schedule]
-        if self._pending is not None:
-            plans.append(self._pending)
+    def watched_robots(self) -> frozenset[int]:
+        """Robots whose observations a plan at hand needs."""
         return frozenset(
-            fault.robot for plan in plans for fault in plan.faults if fault.mode == Mode.RANDOM
+            fault.robot
+            for plan in self.book.plans
+            for fault in plan.faults
+            if fault_mode(fault.mode).needs & _FROM_OBSERVATION
         )
+
+    @property
+    def needs_world(self) -> bool:
+        """Whether a plan at hand needs ``world``."""
+        return any(f.trigger.needs_world for plan in self.book.plans for f in plan.faults)
+
+    def _why_not(self, plan: CrashPlan) -> str:
+        for fault in plan.faults:
+            try:
+                mode = fault_mode(fault.mode)
+                check_parameters(fault.mode, dict(fault.parameters))
+            except UserError as error:
+                return str(error)
+            if unmet := mode.needs - OFFERED:
+                return (
+                    f"fault {fault.mode} needs commands with {', '.join(sorted(unmet))}, which "
+                    "crash_coach_interfaces/msg/Action has not"
+                )
+            if issubclass(mode, ObservationFault) and not self._relays:
+                return (
+                    f"fault {fault.mode} changes observations, but the gate does not relay them: "
+                    "start it with relay_observations:=true, and the policies with "
+                    "observation_topic:=observation_seen"
+                )
+        return ""
+
+    # --- what comes in ----------------------------------------------------------------------
 
     def plan(self, plan: CrashPlan, lease_s: float, now_s: float) -> Outputs:
         """Takes a plan or its heartbeat (the same revision again)."""
-        if self._known and plan.revision == self._revision:
-            self._deadline_s = now_s + lease_s
-            return ()
-        # After a lease ran out any revision is welcome: the coach may be a new one.
-        if self._known and plan.revision < self._revision:
-            self.ignored_plans += 1
-            return ()
-        if plan.episode < self._episode:
-            self.ignored_plans += 1
-            self._extend(now_s + lease_s)
-            return ()
-        self._known, self._expired, self._revision = True, False, plan.revision
-        self._deadline_s = now_s + lease_s
-        return (*self._arm(plan), *self._release(now_s))
-
-    def _extend(self, deadline_s: float) -> None:
-        if self._known:
-            self._deadline_s = deadline_s
-
-    def _arm(self, plan: CrashPlan) -> Outputs:
-        first, replaced = 0, self._pending
-        if plan.episode == self._episode:
-            first = self._next_step()
-            replaced = self._schedule[-1][1] if self._schedule else None
-            self._schedule = [entry for entry in self._schedule if entry[0] < first]
-            self._schedule.append((first, plan.resolved(first)))
-        else:
-            self._pending = plan.resolved(0)
-        armed = Event(EventKind.ARMED, plan.episode, first, plan.revision)
-        had_faults = replaced is not None and replaced.episode == plan.episode and replaced.faults
-        if plan.faults or not had_faults:
-            return (armed,)
-        return (armed, replace(armed, kind=EventKind.CLEARED))
-
-    def _next_step(self) -> int:
-        """First step of the current episode that nothing was relayed of."""
-        return 1 + max(
-            (step for episode, step in self._done if episode == self._episode), default=-1
-        )
+        events = self.book.plan(plan, lease_s, now_s)
+        return (*events, *self._release(now_s)) if events else ()
 
     def tick(self, now_s: float) -> Outputs:
         """Call often: ends the lease of a silent coach."""
-        if self._expired or self._deadline_s is None or now_s < self._deadline_s:
-            return ()
-        self._expired, self._known = True, False
-        self._schedule, self._pending = [], None
-        event = Event(EventKind.EXPIRED, max(self._episode, 0), self._next_step(), self._revision)
-        return (event, *self._release(now_s))
+        events = self.book.tick(now_s)
+        return (*events, *self._release(now_s)) if events else ()
+
+    def world(self, episode: int, step: int, world: World, now_s: float) -> Outputs:
+        """Takes the team's state before ``step``, which conditions look at."""
+        self._worlds.put(episode, step, world)
+        return self._release(now_s)
 
     def command(self, command: Command, now_s: float) -> Outputs:
         """Decides a command, repeats the decision for a duplicate, holds or drops it."""
@@ -168,7 +132,7 @@ class GateState:
         if key == done:
             last = self._last[command.robot]
             return () if last is None else (last._replace(repeated=True),)
-        if key < done or command.episode < self._episode:
+        if key < done or command.episode < self.book.episode:
             self.late += 1
             return ()
         held = self._held[command.robot]
@@ -179,83 +143,148 @@ class GateState:
             if key < held.key:
                 return ()
             self._held[command.robot] = None
-        return self._try(command, now_s)
+        return self._decide(command, now_s)
 
-    def observation(
-        self, robot: int, episode: int, step: int, available: BoolArray, now_s: float
-    ) -> Outputs:
-        """Takes a robot's (A,) availability, which random faults draw from."""
-        self._masks[robot] = ((episode, step), available)
+    def observation(self, sight: Sight, now_s: float) -> Outputs:
+        """Takes an observation: its availability, and all of it where observations are relayed."""
+        robot = sight.robot
+        self._masks[robot] = (sight.key, sight.available)
+        outputs = self._see(sight, now_s) if self._relays else ()
         held = self._held[robot]
         if held is None:
-            return ()
+            return outputs
         self._held[robot] = None
-        return self._try(held, now_s)
+        return (*outputs, *self._decide(held, now_s))
 
     def _release(self, now_s: float) -> Outputs:
-        outputs: list[Decision | Event] = []
-        for robot, held in enumerate(self._held):
+        outputs: list[Decision | Seen | Event] = []
+        for robot in range(self._n):
+            sight, self._held_sights[robot] = self._held_sights[robot], None
+            if sight is not None:
+                outputs.extend(self._see(sight, now_s))
+            held, self._held[robot] = self._held[robot], None
             if held is not None:
-                self._held[robot] = None
-                outputs.extend(self._try(held, now_s))
+                outputs.extend(self._decide(held, now_s))
         return tuple(outputs)
 
-    def _try(self, command: Command, now_s: float) -> Outputs:
-        """Decides or holds a command that is newer than everything decided for its robot."""
-        if command.episode < self._episode:
-            self.late += 1
-            return ()
-        if command.episode > self._episode and not self._enter(command.episode):
-            return self._hold(command, now_s)
-        plan = self._plan_at(command.step)
-        mode = Mode.NONE if plan is None else plan.mode_of(command.step, command.robot)
-        applied = command.action
-        if plan is not None and mode == Mode.MUTE:
-            applied = NOTHING_APPLIED
-        elif plan is not None and mode == Mode.RANDOM:
-            drawn = self._draw(plan, command)
-            if drawn is None:
-                return self._hold(command, now_s)
-            applied = drawn
-        decision = Decision(
-            command, mode, applied, self._revision if plan is None else plan.revision
-        )
-        self._done[command.robot] = command.key
-        self._last[command.robot] = decision
-        return (decision,)
-
     def _enter(self, episode: int) -> bool:
-        """Makes ``episode`` the current one where its plan is there or need not be."""
-        pending = self._pending
-        if pending is not None and pending.episode == episode:
-            self._schedule = [(0, pending)]
-        elif self._expired or not self._lockstep:
-            self._schedule = []
-        else:
+        if not self.book.enter(episode):
             return False
-        self._episode = episode
-        if pending is not None and pending.episode <= episode:
-            self._pending = None
+        for stream in (*self._commands, *self._sights):
+            stream.begin()
+        self._worlds.forget_before(episode)
         return True
 
-    def _hold(self, command: Command, now_s: float) -> Outputs:
-        self._held[command.robot] = command
-        if self._deadline_s is None:
-            self._deadline_s = now_s + self._first_lease_s
-        return ()
+    # --- commands ---------------------------------------------------------------------------
 
-    def _plan_at(self, step: int) -> CrashPlan | None:
-        for first, plan in reversed(self._schedule):
-            if first <= step:
-                return plan
-        return None
+    def _decide(self, command: Command, now_s: float) -> Outputs:
+        """Decides or holds a command that is newer than everything decided for its robot."""
+        robot, episode, step, action, _, _ = command
+        book = self.book
+        if episode != book.episode:
+            if episode < book.episode:
+                self.late += 1
+                return ()
+            if not self._enter(episode):
+                book.wait(now_s)
+                self._held[robot] = command
+                return ()
+        term = book.at(step)
+        stream = self._commands[robot]
+        events = stream.follow(term, step)
+        if term is None or stream.team is None:
+            stream.passed = action
+            revision = book.revision if term is None else term.revision
+            decision = Decision(command, "", 0, action, revision)
+        else:
+            if not self._reach(stream, stream.team, (episode, step), events):
+                self._held[robot] = command
+                return tuple(events)
+            faulted = self._fault(stream, stream.team, command, term)
+            if faulted is None:
+                self._held[robot] = command
+                return tuple(events)
+            decision = faulted
+        self._done[robot] = (episode, step)
+        self._last[robot] = decision
+        if step >= book.next_step:
+            book.next_step = step + 1
+        return (*events, decision) if events else (decision,)
 
-    def _draw(self, plan: CrashPlan, command: Command) -> int | None:
-        """The random action; None: its availability is not there yet."""
-        seen = self._masks[command.robot]
-        if self._lockstep and (seen is None or seen[0] != command.key):
+    def _fault(
+        self, stream: RobotFaults, team: TeamFaults[int], command: Command, term: Term
+    ) -> Decision | None:
+        """The decision in the step entered; None: its availability is not there yet."""
+        robot = command.robot
+        needs, seen = team.needs(robot), self._masks[robot]
+        if (
+            self._lockstep
+            and needs & _FROM_OBSERVATION
+            and (seen is None or seen[0] != command.key)
+        ):
             return None
-        if seen is None:
-            return NOTHING_APPLIED
-        bits = random_bits(plan.seed, command.episode, command.step, command.robot)
-        return int(random_available(bits, seen[1][None, :])[0])
+        if "worst" in needs and command.worst == UNTOLD:
+            self.untold[robot] += 1
+        tools = ActionTools(None if seen is None else seen[1], command.worst)
+        mode, entry, passed = team.command(robot, command.action, tools)
+        if passed is not None:
+            stream.passed = passed
+        applied = WITHHELD if passed is None else passed
+        of_sight = bool(mode) and issubclass(fault_mode(mode), ObservationFault)
+        return Decision(command, mode, entry, applied, term.revision, observation=of_sight)
+
+    # --- observations -----------------------------------------------------------------------
+
+    def _see(self, sight: Sight, now_s: float) -> Outputs:
+        robot, book = sight.robot, self.book
+        last = self._seen[robot]
+        if last is not None and sight.key <= last.sight.key:
+            return (last,) if sight.key == last.sight.key else ()
+        if sight.episode < book.episode:
+            return ()
+        if sight.episode > book.episode and not self._enter(sight.episode):
+            book.wait(now_s)
+            self._held_sights[robot] = sight
+            return ()
+        term = book.at(sight.step)
+        stream = self._sights[robot]
+        outputs: list[Event | Seen] = [*stream.follow(term, sight.step)]
+        seen = sight.features
+        if term is not None and stream.team is not None:
+            begun: list[Event] = []
+            reached = self._reach(stream, stream.team, sight.key, begun)
+            outputs += begun
+            if not reached:
+                self._held_sights[robot] = sight
+                return tuple(outputs)
+            seen = stream.team.observation(robot, sight.features)
+            mode = stream.team.observation_mode(robot)
+            if mode:
+                outputs.append(self._effect(sight, mode, stream.running[-1].entry, term))
+        stream.seen = seen
+        made = Seen(sight, None if seen is sight.features else seen)
+        self._seen[robot] = made
+        if sight.step >= book.next_step:
+            book.next_step = sight.step + 1
+        return (*outputs, made)
+
+    def _effect(self, sight: Sight, mode: str, entry: int, term: Term) -> Event:
+        kind, revision = EventKind.EFFECT, term.revision
+        return Event(kind, sight.episode, sight.step, revision, sight.robot, mode, entry, OBSERVED)
+
+    def _reach(
+        self, stream: RobotFaults, team: TeamFaults[int], key: tuple[int, int], events: list[Event]
+    ) -> bool:
+        """Enters the step, adding to ``events``; False: the world of that step is not there."""
+        episode, step = key
+        if not team.needs_world:
+            events += stream.enter(step, None)
+            return True
+        world = self._worlds.at(episode, step)
+        if world is None:
+            return False
+        # Steps that this stream skips but another one entered: both see the same conditions.
+        for passed, before in self._worlds.between(episode, team.step + 1, step):
+            events += stream.enter(passed, before)
+        events += stream.enter(step, world)
+        return True
