@@ -14,6 +14,13 @@ def greedy(q: FloatArray, available: BoolArray) -> IntArray:
     return best
 
 
+def least_valued(q: FloatArray, available: BoolArray) -> IntArray:
+    """As ``greedy``, (...) the worst available action, the first of equals."""
+    masked = np.where(available, q, np.float32(np.inf))
+    worst: IntArray = masked.argmin(axis=-1).astype(np.int32)
+    return worst
+
+
 def epsilon_greedy(
     q: FloatArray, available: BoolArray, epsilon: float, rng: np.random.Generator
 ) -> IntArray:

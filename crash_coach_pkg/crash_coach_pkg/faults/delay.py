@@ -24,9 +24,9 @@ class Delay(CommandFault[C]):
     name: ClassVar[str] = "delay"
     code: ClassVar[int] = 4
     summary: ClassVar[str] = (
-        "Commands arrive late: each step passes on the newest one that is old enough, once; nothing "
-        "in the first steps of the fault, or where it is not available any more. Commands still "
-        "under way when the fault ends are lost."
+        "Commands arrive late: each step passes on the newest one that is old enough, once; "
+        "nothing in the first steps of the fault, or where it is not available any more. Commands "
+        "still under way when the fault ends are lost."
     )
     Parameters: ClassVar[type[FaultParameters]] = DelayParameters
     needs: ClassVar[frozenset[Need]] = frozenset(("availability",))
