@@ -144,6 +144,13 @@ class Coach:
         """Lets strategies that follow training progress move the rate."""
         self._set_rate(self._strategy.next_rate(self._rate, None, progress))
 
+    def resume(self, rate: float, progress: Progress) -> None:
+        """Goes on from the ``rate`` that another coach had in force; a strategy that does not
+        depend on the rate before (fixed, curriculum) keeps its own."""
+        new = self._strategy.next_rate(rate, None, progress)
+        ceiling = self._config.alpha_max
+        self._set_rate(new if ceiling is None else min(new, ceiling))
+
     def record_block(self, success_rate: float, progress: Progress) -> BlockRecord:
         """Ends an evaluation block with its success rate e_t and moves the rate.
 

@@ -7,8 +7,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from crash_coach_pkg.coach import BlockRecord, Coach
-from crash_coach_pkg.config import CoachConfig
+from crash_coach_pkg.coach import BlockRecord, Coach, Planner
+from crash_coach_pkg.config import CoachConfig, TeamSpec
 from crash_coach_pkg.plan import NEXT_STEP, CrashPlan
 from crash_coach_pkg.strategies import Progress
 
@@ -57,17 +57,24 @@ class Control:
 
     Args:
         settings: at start.
-        robots: names of the team, in robot order.
+        team: whom it plans for.
         revision: the first plan's is larger.
+        scenario: plans every episode instead of the coach, whose settings then count for nothing.
 
     Raises:
         UserError: settings that this team cannot keep.
     """
 
-    def __init__(self, settings: ControlSettings, robots: tuple[str, ...], revision: int) -> None:
-        self._robots = robots
+    def __init__(
+        self,
+        settings: ControlSettings,
+        team: TeamSpec,
+        revision: int,
+        scenario: Planner | None = None,
+    ) -> None:
         self._settings = settings
-        self._coach = Coach(settings.coach, robots, settings.seed)
+        self._coach = Coach(settings.coach, team, settings.seed)
+        self._scenario = scenario
         self._first_revision = revision
         self._revision = revision
         self._plan: CrashPlan | None = None
@@ -95,18 +102,36 @@ class Control:
         self._ended = False
         return self._revise(self._draw(episode))
 
+    def adopt(self, plan: CrashPlan) -> CrashPlan | None:
+        """Takes over a plan that a coach before this one left in force; call before ``follow``.
+
+        Returns the same faults under a newer revision; None where there never was a plan
+        (revision 0) or this coach has one already. The rate goes on from the plan's, and the
+        plan's episode counts as that many finished ones. What a lease or /coach/clear_all ended
+        is ended until the next episode: such a plan has no faults.
+        """
+        if self._plan is not None or plan.revision == 0:
+            return None
+        self._first_revision = self._revision = max(self._revision, plan.revision)
+        self._ended = False
+        self._finished = plan.episode
+        if self._scenario is None:
+            self._coach.resume(plan.rate, self._progress())
+        return self._revise(plan)
+
     def finish(self, success: bool) -> BlockRecord | None:
         """Call when the running episode ended; returns the record of a block that is complete.
 
         Episodes count while the coach is enabled; a second call for the same episode is ignored.
+        A fault scenario has no blocks.
         """
         if self._ended or self._plan is None:
             return None
         self._ended = True
-        if not self._settings.enabled:
+        if not self._settings.enabled or self._scenario is not None:
             return None
         self._finished += 1
-        progress = Progress(env_steps=0, total_steps=0, episodes=self._finished)
+        progress = self._progress()
         self._coach.count(self._plan)
         self._coach.advance(progress)
         self._block.append(success)
@@ -130,8 +155,16 @@ class Control:
         if not now or self._plan is None:
             return None
         plan = self._draw(self._plan.episode)
-        faults = tuple(replace(fault, start_step=NEXT_STEP) for fault in plan.faults)
-        return self._revise(replace(plan, faults=faults))
+        if self._scenario is None:  # a scenario's faults keep their steps
+            faults = tuple(replace(fault, start_step=NEXT_STEP) for fault in plan.faults)
+            plan = replace(plan, faults=faults)
+        return self._revise(plan)
+
+    def armed(self, revision: int, step: int) -> None:
+        """The gate carries ``revision`` out from ``step`` on: publishing it again, even as part of
+        a newer revision, must not start its faults anew."""
+        if self._plan is not None and self._plan.revision == revision:
+            self._plan = self._plan.resolved(step)
 
     def snapshot(self) -> Snapshot:
         return Snapshot(self._settings, self._coach, self._plan)
@@ -158,8 +191,12 @@ class Control:
         self._revision = max(self._revision, revision)
         return self._revise(self._plan)
 
+    def _progress(self) -> Progress:
+        return Progress(env_steps=0, total_steps=0, episodes=self._finished)
+
     def _draw(self, episode: int) -> CrashPlan:
-        plan = self._coach.plan(episode)
+        planner: Planner = self._coach if self._scenario is None else self._scenario
+        plan = planner.plan(episode)
         return plan if self._settings.enabled else replace(plan, cap=0, faults=())
 
     def _revise(self, plan: CrashPlan) -> CrashPlan:

@@ -1,0 +1,171 @@
+"""The coach's topics: follows episodes, publishes plans and heartbeats, hears the gate."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+from crash_coach_interfaces.msg import CrashPlan as CrashPlanMessage
+from crash_coach_interfaces.msg import EpisodeState, FaultEvent
+from rclpy.clock import Clock, ClockType
+from rclpy.context import Context
+from rclpy.node import Node
+
+from crash_coach_pkg.control import Control
+from crash_coach_pkg.plan import CrashPlan
+from crash_coach_pkg.ros.convert import (
+    Played,
+    message_from_plan,
+    plan_from_message,
+    played_from_bytes,
+)
+from crash_coach_pkg.ros.run import EPISODE, EVENTS, PLAN, TICK_S
+from sim_pkg.contract import UserError
+
+ARM_TIMEOUT_S = 2.0
+HEARTBEATS_PER_LEASE = 3
+IN_FORCE = "/coach/plan_in_force"
+# How long the first plan waits for the gate to say what is in force, and to be discovered at all.
+ADOPT_TIMEOUT_S = 1.0
+DISCOVERY_S = 0.3
+ENDLESS = Played(episode=0, ended=False, success=False)
+
+
+class CoachLink(Node):
+    """``changed`` guards ``control`` and what the gate answered.
+
+    Args:
+        follow_sim: follow the sim's episodes; otherwise episode 0 starts at once and never ends.
+        check: called often; what it raises ends this node's thread.
+    """
+
+    def __init__(
+        self,
+        control: Control,
+        robots: tuple[str, ...],
+        follow_sim: bool,
+        check: Callable[[], None],
+        context: Context | None = None,
+    ) -> None:
+        super().__init__(
+            "coach_link",
+            context=context,
+            use_global_arguments=False,
+            start_parameter_services=False,
+            enable_rosout=False,
+        )
+        self.control = control
+        self.changed = threading.Condition()
+        self._robots = robots
+        self._check = check
+        self._armed_revision = 0
+        self._refused: dict[int, str] = {}  # reasons, by revision
+        self._due_s = 0.0
+        self._started_s = time.monotonic()
+        self._settled = False  # whether it is known what a coach before this one left in force
+        self._left: CrashPlan | None = None
+        self._waiting: list[Played] = [] if follow_sim else [ENDLESS]
+        self._plans = self.create_publisher(CrashPlanMessage, "/coach/plan", PLAN)
+        self.create_subscription(CrashPlanMessage, IN_FORCE, self._on_plan_in_force, PLAN)
+        if follow_sim:
+            self.create_subscription(
+                EpisodeState, "/sim/boundary", self._on_episode, EPISODE, raw=True
+            )
+        self.create_subscription(FaultEvent, "/coach/events", self._on_event, EVENTS)
+        self.create_timer(TICK_S, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def publish(self, plan: CrashPlan | None) -> None:
+        """Call with ``changed`` held; None publishes nothing."""
+        if plan is None:
+            return
+        lease_s = self.control.settings.lease_s
+        self._due_s = time.monotonic() + lease_s / HEARTBEATS_PER_LEASE - TICK_S
+        stamp = self.get_clock().now().to_msg()
+        self._plans.publish(message_from_plan(plan, self._robots, lease_s, stamp))
+
+    def await_gate(self, plan: CrashPlan) -> str:
+        """Waits for ARMED, with ``changed`` held; returns what is wrong, or nothing."""
+        revision = plan.revision
+        answered = self.changed.wait_for(
+            lambda: self._armed_revision >= revision or revision in self._refused,
+            timeout=ARM_TIMEOUT_S,
+        )
+        if not answered:
+            return f"no gate armed the plan within {ARM_TIMEOUT_S:g} s"
+        reason = self._refused.get(revision)
+        return "" if reason is None else f"the gate refused: {reason}"
+
+    def settle(self, at_once: bool = True) -> None:
+        """Takes over what is in force, with ``changed`` held, and plans what waits for that.
+
+        ``at_once``: whether the gate has told what it is or not.
+        """
+        if self._settled or not (at_once or self._may_settle()):
+            return
+        self._settled = True
+        adopted = None if self._left is None else self.control.adopt(self._left)
+        for played in self._waiting:
+            self._follow(played)
+        self._waiting.clear()
+        if adopted is not None and self.control.plan == adopted:
+            self.publish(adopted)
+
+    def _may_settle(self) -> bool:
+        if not self._waiting:
+            return False
+        waited_s = time.monotonic() - self._started_s
+        gate = self.count_publishers(IN_FORCE) > 0
+        return waited_s >= (ADOPT_TIMEOUT_S if gate else DISCOVERY_S) or self._left is not None
+
+    def _follow(self, played: Played) -> None:
+        self.publish(self.control.follow(played.episode))
+        record = self.control.finish(played.success) if played.ended else None
+        if record is not None:
+            self.get_logger().info(f"block: {record}")
+
+    def _on_episode(self, data: bytes) -> None:
+        try:
+            played = played_from_bytes(data)
+        except UserError as error:
+            self.get_logger().error(f"{error}; ignored")
+            return
+        with self.changed:
+            if self._settled:
+                self._follow(played)
+                return
+            self._waiting.append(played)
+            self.settle(at_once=False)
+
+    def _on_plan_in_force(self, message: CrashPlanMessage) -> None:
+        with self.changed:
+            if self._settled:
+                return
+            try:
+                self._left = plan_from_message(message, self._robots)
+            except ValueError as error:
+                self.get_logger().error(f"plan in force {message.revision}: {error}; ignored")
+            self.settle(at_once=False)
+
+    def _on_event(self, message: FaultEvent) -> None:
+        with self.changed:
+            if self._armed_revision == 0:  # later, a newer coach would be fought over every event
+                self.publish(self.control.overtake(message.revision))
+            if not self.control.published(message.revision):
+                return
+            if message.kind == FaultEvent.ARMED:
+                self._armed_revision = message.revision
+                self._refused.clear()
+                self.control.armed(message.revision, message.step)
+                self.changed.notify_all()
+            elif message.kind == FaultEvent.REFUSED:
+                self._refused[message.revision] = message.detail
+                self.get_logger().error(f"the gate refused a plan: {message.detail}")
+                self.changed.notify_all()
+
+    def _on_tick(self) -> None:
+        self._check()
+        with self.changed:
+            self.settle(at_once=False)
+            if time.monotonic() >= self._due_s:
+                self.publish(self.control.plan)
