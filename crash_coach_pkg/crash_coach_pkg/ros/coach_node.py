@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -164,7 +165,7 @@ def _to_ros(value: Value) -> Value:
     return list(value) if isinstance(value, tuple) else value
 
 
-def _from_ros(value: Value) -> Value:
+def _from_ros(value: Any) -> Value:
     """Lists, tuples and arrays become tuples."""
     return value if isinstance(value, bool | int | float | str) else tuple(value)
 
