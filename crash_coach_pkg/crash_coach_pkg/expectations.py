@@ -30,7 +30,7 @@ class DueFault:
     """A fault whose time came: its start step was reached, or its trigger fired."""
 
     entry: int
-    robot: int
+    robot: str
     took_effect: bool
 
 
