@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from crash_coach_pkg.faults.base import Vector
+from crash_coach_pkg.faults.base import Need, Vector
 from crash_coach_pkg.gate import random_available
 from sim_pkg.contract import BoolArray
+
+ACTION_OFFERS: frozenset[Need] = frozenset(("availability", "sampler", "worst"))
 
 UNTOLD = -1
 """``Action.worst_action`` of a policy that does not tell."""

@@ -8,11 +8,10 @@ each of them.
 from __future__ import annotations
 
 from crash_coach_pkg.action_tools import UNTOLD, ActionTools
-from crash_coach_pkg.faults import check_parameters, fault_mode
+from crash_coach_pkg.effects import OBSERVED, WITHHELD
+from crash_coach_pkg.faults import fault_mode
 from crash_coach_pkg.faults.base import Need, ObservationFault
 from crash_coach_pkg.gate_types import (
-    OBSERVED,
-    WITHHELD,
     Command,
     Decision,
     Outputs,
@@ -20,11 +19,11 @@ from crash_coach_pkg.gate_types import (
     Sight,
 )
 from crash_coach_pkg.plan import CrashPlan
-from crash_coach_pkg.plan_book import Event, EventKind, PlanBook, Term
+from crash_coach_pkg.plan_book import Event, EventKind, PlanBook, Term, why_not
 from crash_coach_pkg.robot_faults import RobotFaults, Worlds
 from crash_coach_pkg.schedule import World
 from crash_coach_pkg.team_faults import TeamFaults
-from sim_pkg.contract import BoolArray, UserError
+from sim_pkg.contract import BoolArray
 
 OFFERED: frozenset[Need] = frozenset(("availability", "sampler", "worst"))
 _FROM_OBSERVATION: frozenset[Need] = frozenset(("availability", "sampler"))
@@ -64,7 +63,7 @@ class GateState:
         self._held_sights: list[Sight | None] = [None] * n_robots
         self._masks: list[tuple[tuple[int, int], BoolArray] | None] = [None] * n_robots
         self._worlds = Worlds(n_robots, lockstep)
-        self.late = 0
+        self.late = [0] * n_robots
         """Commands dropped because a newer one of the same robot or a newer episode came first."""
         self.untold = [0] * n_robots
         """Robot-steps under a fault that needs the worst action, which the policy did not tell."""
@@ -89,24 +88,7 @@ class GateState:
         return any(f.trigger.needs_world for plan in self.book.plans for f in plan.faults)
 
     def _why_not(self, plan: CrashPlan) -> str:
-        for fault in plan.faults:
-            try:
-                mode = fault_mode(fault.mode)
-                check_parameters(fault.mode, dict(fault.parameters))
-            except UserError as error:
-                return str(error)
-            if unmet := mode.needs - OFFERED:
-                return (
-                    f"fault {fault.mode} needs commands with {', '.join(sorted(unmet))}, which "
-                    "crash_coach_interfaces/msg/Action has not"
-                )
-            if issubclass(mode, ObservationFault) and not self._relays:
-                return (
-                    f"fault {fault.mode} changes observations, but the gate does not relay them: "
-                    "start it with relay_observations:=true, and the policies with "
-                    "observation_topic:=observation_seen"
-                )
-        return ""
+        return why_not(plan, OFFERED, self._relays)
 
     # --- what comes in ----------------------------------------------------------------------
 
@@ -133,13 +115,13 @@ class GateState:
             last = self._last[command.robot]
             return () if last is None else (last._replace(repeated=True),)
         if key < done or command.episode < self.book.episode:
-            self.late += 1
+            self.late[command.robot] += 1
             return ()
         held = self._held[command.robot]
         if held is not None:
             if key == held.key:
                 return ()
-            self.late += 1
+            self.late[command.robot] += 1
             if key < held.key:
                 return ()
             self._held[command.robot] = None
@@ -183,7 +165,7 @@ class GateState:
         book = self.book
         if episode != book.episode:
             if episode < book.episode:
-                self.late += 1
+                self.late[robot] += 1
                 return ()
             if not self._enter(episode):
                 book.wait(now_s)

@@ -5,11 +5,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from crash_coach_pkg.action_tools import UNTOLD
-from crash_coach_pkg.plan_book import NOTHING, Event
+from crash_coach_pkg.plan_book import Event
 from sim_pkg.contract import BoolArray, FloatArray
-
-WITHHELD = NOTHING
-OBSERVED = -2
 
 
 class Command(NamedTuple):

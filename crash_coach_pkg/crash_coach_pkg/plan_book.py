@@ -11,12 +11,14 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import NamedTuple
 
+from crash_coach_pkg.effects import NO_ACTION
+from crash_coach_pkg.faults import check_parameters, fault_mode, unmet_needs
+from crash_coach_pkg.faults.base import Need, ObservationFault
 from crash_coach_pkg.plan import CrashPlan
+from sim_pkg.contract import UserError
 
 TEAM = -1
 """``Event.robot`` where an event concerns the whole team."""
-NOTHING = -1
-"""``Event.applied`` (and intent on the wire) where there is none; for EFFECT: withheld."""
 
 
 class EventKind(IntEnum):
@@ -45,8 +47,32 @@ class Event(NamedTuple):
     robot: int = TEAM
     mode: str = ""
     entry: int = 0
-    applied: int = NOTHING
+    applied: int = NO_ACTION
     detail: str = ""
+
+
+def why_not(plan: CrashPlan, offered: frozenset[Need], observations: bool) -> str:
+    """Why a gate cannot carry out ``plan``; empty where it can.
+
+    Args:
+        offered: what its commands' type offers to faults.
+        observations: whether it relays observations.
+    """
+    for fault in plan.faults:
+        try:
+            mode = fault_mode(fault.mode)
+            check_parameters(fault.mode, dict(fault.parameters))
+        except UserError as error:
+            return str(error)
+        if unmet := unmet_needs(fault.mode, offered):
+            return unmet
+        if issubclass(mode, ObservationFault) and not observations:
+            return (
+                f"fault {fault.mode} changes observations, which this gate does not relay: start "
+                "it with relay_observations:=true, and the policies with "
+                "observation_topic:=observation_seen"
+            )
+    return ""
 
 
 @dataclass(eq=False, slots=True)

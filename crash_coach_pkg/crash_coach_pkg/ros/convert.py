@@ -1,24 +1,29 @@
 """Messages to and from the core's types.
 
-Commands stay in the form in which they travel: making Python message objects of them took more
-than half of the gate's time. The layout is plain little-endian CDR (OMG DDS-RTPS 2.5, section 10;
-XCDR version 1); a test holds it against rclpy's own serialization.
+Commands and observations stay in the form in which they travel: making Python message objects of
+them took more than half of the gate's time. The layout is plain little-endian CDR (OMG DDS-RTPS
+2.5, section 10; XCDR version 1); a test holds it against rclpy's own serialization.
 """
 
 from __future__ import annotations
 
+import math
 import struct
 from dataclasses import dataclass
 
+import numpy as np
 from builtin_interfaces.msg import Time
-from crash_coach_interfaces.msg import Action, FaultEvent
 from crash_coach_interfaces.msg import CrashPlan as CrashPlanMessage
+from crash_coach_interfaces.msg import EpisodeState, FaultEvent
 from crash_coach_interfaces.msg import Fault as FaultMessage
-from rclpy.serialization import deserialize_message
 from std_msgs.msg import Header
 
-from crash_coach_pkg.gate_state import Command, Decision, Event
-from crash_coach_pkg.plan import CrashPlan, Fault, Mode, parse_mode
+from crash_coach_pkg.effects import NO_ACTION
+from crash_coach_pkg.faults import fault_mode, mode_code
+from crash_coach_pkg.gate_types import Command, Decision, Seen, Sight
+from crash_coach_pkg.plan import CrashPlan, Fault, Trigger, TriggerKind
+from crash_coach_pkg.plan_book import TEAM, Event
+from crash_coach_pkg.schedule import World
 from sim_pkg.contract import UserError
 
 # Encapsulation (4 bytes), stamp (8), length of frame_id (4), frame_id, padding to 4, fields.
@@ -26,11 +31,11 @@ _LITTLE_ENDIAN = b"\x00\x01"
 _ENCAPSULATION_SIZE = 4
 _FLAGS = struct.Struct("<???")  # terminated, truncated, success
 _LENGTH = struct.Struct("<I")
+_STAMP = struct.Struct("<iI")
 _FRAME_ID_AT = 16
-_COMMANDED = struct.Struct("<IIiB")  # episode, step, action, fault
-_FAULT_AT = 12
-
-MODE_TEXT = {Mode.NONE: "", Mode.MUTE: "mute", Mode.RANDOM: "random"}
+_COMMANDED = struct.Struct("<IIiiB")  # episode, step, action, worst_action, fault
+_FAULT_AT = 16
+_OBSERVED = struct.Struct("<IIiI")  # episode, step, last_action, number of features
 
 
 def message_from_plan(
@@ -47,9 +52,14 @@ def message_from_plan(
         faults=[
             FaultMessage(
                 robot=robots[fault.robot],
-                mode=MODE_TEXT[fault.mode],
+                mode=fault.mode,
                 start_step=fault.start_step,
                 duration_steps=fault.duration_steps,
+                parameter_names=[name for name, _ in fault.parameters],
+                parameter_values=[float(value) for _, value in fault.parameters],
+                trigger=int(fault.trigger.kind),
+                trigger_values=list(fault.trigger.values),
+                entry=fault.entry,
             )
             for fault in plan.faults
         ],
@@ -57,19 +67,41 @@ def message_from_plan(
 
 
 def plan_from_message(message: CrashPlanMessage, robots: tuple[str, ...]) -> CrashPlan:
-    """Raises ValueError for an unknown robot or mode, or a lease that is not positive."""
-    if not message.lease_s > 0:
-        raise ValueError(f"lease_s {message.lease_s} is not positive")
-    faults = []
-    for fault in message.faults:
-        if fault.robot not in robots:
-            raise ValueError(f"unknown robot {fault.robot!r}; one of: {', '.join(robots)}")
-        mode = parse_mode(fault.mode)
-        faults.append(
-            Fault(robots.index(fault.robot), mode, fault.start_step, fault.duration_steps)
-        )
+    """Raises UserError for what no gate could carry out: an unknown robot or mode, a trigger or
+    parameters that are malformed, a lease that is not positive."""
+    if not 0 < message.lease_s < math.inf:
+        raise UserError(f"lease_s {message.lease_s} is not a positive number of seconds")
     return CrashPlan(
-        message.episode, message.revision, message.seed, message.rate, message.cap, tuple(faults)
+        message.episode,
+        message.revision,
+        message.seed,
+        message.rate,
+        message.cap,
+        tuple(_fault(fault, robots) for fault in message.faults),
+    )
+
+
+def _fault(message: FaultMessage, robots: tuple[str, ...]) -> Fault:
+    if message.robot not in robots:
+        raise UserError(f"unknown robot {message.robot!r}; one of: {', '.join(robots)}")
+    names, values = message.parameter_names, message.parameter_values
+    if len(names) != len(values):
+        raise UserError(f"{len(names)} parameter names, but {len(values)} values")
+    for value in (*values, *message.trigger_values):
+        if not math.isfinite(value):
+            raise UserError(f"{value} of fault {message.mode} on {message.robot} is not a number")
+    try:
+        trigger = Trigger(TriggerKind(message.trigger), tuple(message.trigger_values))
+    except ValueError as error:
+        raise UserError(f"fault {message.mode} on {message.robot}: {error}") from error
+    return Fault(
+        robot=robots.index(message.robot),
+        mode=fault_mode(message.mode).name,
+        start_step=message.start_step,
+        duration_steps=message.duration_steps,
+        parameters=tuple(zip(names, values, strict=True)),
+        trigger=trigger,
+        entry=message.entry,
     )
 
 
@@ -79,22 +111,22 @@ def command_from_bytes(robot: int, data: bytes) -> Command:
     Raises:
         UserError: not little-endian CDR, or cut short.
     """
-    start = _body(data)
-    episode, step, action, _ = _COMMANDED.unpack_from(data, start)
-    return Command(robot, episode, step, action, (data, start))
+    start = _body("command", data)
+    if len(data) < start + _COMMANDED.size:
+        raise UserError(f"command of {len(data)} bytes is cut short")
+    episode, step, action, worst, _ = _COMMANDED.unpack_from(data, start)
+    return Command(robot, episode, step, action, worst, (data, start))
 
 
-def _body(data: bytes) -> int:
-    """Where an Action's fields start behind its header."""
+def _body(what: str, data: bytes) -> int:
+    """Where a message's fields start behind its header."""
     if data[:2] != _LITTLE_ENDIAN:
-        raise UserError(f"command: encapsulation {data[:2].hex()} is not little-endian CDR")
+        raise UserError(f"{what}: encapsulation {data[:2].hex()} is not little-endian CDR")
     try:
         (length,) = _LENGTH.unpack_from(data, _FRAME_ID_AT - _LENGTH.size)
     except struct.error as error:
-        raise UserError(f"command of {len(data)} bytes is cut short: {error}") from error
+        raise UserError(f"{what} of {len(data)} bytes is cut short: {error}") from error
     start: int = _FRAME_ID_AT + (length + 3 & ~3)
-    if len(data) < start + _COMMANDED.size:
-        raise UserError(f"command of {len(data)} bytes is cut short")
     return start
 
 
@@ -102,27 +134,67 @@ def bytes_from_decision(decision: Decision) -> bytes:
     """What goes out on /<robot>/command: the bytes that came in, where nothing was replaced."""
     data: bytes
     data, start = decision.command.token
-    if decision.mode == Mode.NONE and data[start + _FAULT_AT] == Mode.NONE:
+    if not decision.mode and data[start + _FAULT_AT] == 0:
         return data
     command = decision.command
     return data[:start] + _COMMANDED.pack(
-        command.episode, command.step, decision.applied, decision.mode
+        command.episode, command.step, decision.applied, command.worst, mode_code(decision.mode)
     )
 
 
 def effect_from_decision(decision: Decision, robots: tuple[str, ...]) -> FaultEvent:
     command = decision.command
+    data: bytes
+    data, _ = command.token
+    sec, nanosec = _STAMP.unpack_from(data, _ENCAPSULATION_SIZE)
+    (length,) = _LENGTH.unpack_from(data, _FRAME_ID_AT - _LENGTH.size)
+    frame_id = data[_FRAME_ID_AT : _FRAME_ID_AT + length].rstrip(b"\0").decode()
     return FaultEvent(
-        header=deserialize_message(command.token[0], Action).header,
+        header=Header(stamp=Time(sec=sec, nanosec=nanosec), frame_id=frame_id),
         kind=FaultEvent.EFFECT,
         episode=command.episode,
         step=command.step,
         revision=decision.revision,
         robot=robots[command.robot],
-        mode=MODE_TEXT[decision.mode],
+        mode=decision.mode,
+        entry=decision.entry,
         intent=command.action,
         applied=decision.applied,
     )
+
+
+def sight_from_bytes(robot: int, data: bytes) -> Sight:
+    """A serialized Observation, which is the token (and where its features start).
+
+    Raises:
+        UserError: not little-endian CDR, or cut short.
+    """
+    start = _body("observation", data)
+    try:
+        episode, step, _, count = _OBSERVED.unpack_from(data, start)
+        features_at = start + _OBSERVED.size
+        features = np.frombuffer(data, np.float32, count, features_at)
+        (n_actions,) = _LENGTH.unpack_from(data, features_at + 4 * count)
+        available_at = features_at + 4 * count + _LENGTH.size
+        available = np.frombuffer(data, np.uint8, n_actions, available_at) != 0
+    except (struct.error, ValueError) as error:
+        raise UserError(f"observation of {len(data)} bytes is cut short: {error}") from error
+    return Sight(robot, episode, step, features, available, (data, features_at))
+
+
+def bytes_from_seen(seen: Seen) -> bytes:
+    """What goes out on /<robot>/observation_seen: the bytes that came in, where none changed."""
+    data: bytes
+    data, features_at = seen.sight.token
+    if seen.features is None:
+        return data
+    features = np.ascontiguousarray(seen.features, dtype=np.float32).tobytes()
+    return data[:features_at] + features + data[features_at + len(features) :]
+
+
+def world_from_message(message: EpisodeState) -> World:
+    positions_m = np.array(message.positions_m, dtype=np.float32).reshape(-1, 2)
+    return World(positions_m, message.episode_return)
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,13 +232,17 @@ def _align_8(offset: int) -> int:
     return (offset - _ENCAPSULATION_SIZE + 7 & ~7) + _ENCAPSULATION_SIZE
 
 
-def message_from_event(event: Event, stamp: Time) -> FaultEvent:
+def message_from_event(event: Event, robots: tuple[str, ...], stamp: Time) -> FaultEvent:
     return FaultEvent(
         header=Header(stamp=stamp),
         kind=int(event.kind),
         episode=event.episode,
         step=event.step,
         revision=event.revision,
-        intent=-1,
-        applied=-1,
+        robot="" if event.robot == TEAM else robots[event.robot],
+        mode=event.mode,
+        entry=event.entry,
+        intent=NO_ACTION,
+        applied=event.applied,
+        detail=event.detail,
     )

@@ -1,143 +1,200 @@
-"""Executable ``gate``: the data plane. Relays command_raw to command, faulted as planned."""
+"""Executable ``gate``: the data plane. Relays what policies want to robots, faulted as planned."""
 
 from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Sequence
 from functools import partial
 
-import numpy as np
-from crash_coach_interfaces.msg import Action, CrashPlan, FaultEvent, Observation
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
-from rclpy.clock import Clock, ClockType
-from rclpy.context import Context
+from crash_coach_interfaces.msg import Action, EpisodeState, Observation
 from rclpy.executors import Executor
 from rclpy.node import Node
 
-from crash_coach_pkg.gate_state import NOTHING_APPLIED, Decision, EventKind, GateState, Outputs
-from crash_coach_pkg.plan import Mode
+from crash_coach_pkg.effects import WITHHELD
+from crash_coach_pkg.gate_state import GateState
+from crash_coach_pkg.gate_types import Decision, Outputs, Seen
+from crash_coach_pkg.health import Decided
+from crash_coach_pkg.plan import CrashPlan
+from crash_coach_pkg.plan_book import PlanBook
 from crash_coach_pkg.ros.convert import (
     bytes_from_decision,
+    bytes_from_seen,
     command_from_bytes,
     effect_from_decision,
-    message_from_event,
-    plan_from_message,
+    sight_from_bytes,
+    world_from_message,
 )
-from crash_coach_pkg.ros.run import (
-    EVENTS,
-    NEWEST,
-    PLAN,
-    TICK_S,
-    refuse_unknown_parameters,
-    robot_names,
-    spin,
-)
+from crash_coach_pkg.ros.gate_base import ACTION_TYPE, Gate, GateBase
+from crash_coach_pkg.ros.run import EPISODE, NEWEST, spin
 from sim_pkg.contract import UserError
 
-LOCKSTEP = ParameterDescriptor(
-    description="Hold the commands of an episode until its plan is there, and those under a "
-    "random fault until their observation is there. False (real time): never hold.",
-    read_only=True,
-)
-FIRST_LEASE = ParameterDescriptor(
-    description="Lock-step: how long the first commands are held for a coach that has not spoken "
-    "yet, seconds.",
-    read_only=True,
-    floating_point_range=[FloatingPointRange(from_value=0.0, to_value=600.0)],
-)
 
+class ActionGate:
+    """The gate of scenario actions, in lock-step or in real time.
 
-class GateNode(Node):
-    """Parameters: robots, lockstep, first_lease_s.
-
-    Raises:
-        UserError: a parameter is missing, unknown or wrong.
+    Parameters beside GateBase's: lockstep, first_lease_s, relay_observations.
     """
 
-    def __init__(self, context: Context | None = None) -> None:
-        super().__init__("gate", context=context)
-        self._robots = robot_names(self)
-        lockstep: bool = self.declare_parameter("lockstep", True, LOCKSTEP).value
-        first_lease_s: float = self.declare_parameter("first_lease_s", 10.0, FIRST_LEASE).value
-        refuse_unknown_parameters(self)
-        self._state = GateState(len(self._robots), lockstep, first_lease_s)
+    def __init__(self, base: GateBase) -> None:
+        self._base = base
+        robots = base.robots
+        lockstep = base.flag(
+            "lockstep",
+            True,
+            "Hold the commands of an episode until its plan is there, and those under a fault "
+            "that needs their observation until that is there. False (real time): never hold.",
+        )
+        first_lease_s = base.number(
+            "first_lease_s",
+            10.0,
+            (0.0, 600.0),
+            "Lock-step: how long the first commands are held for a coach that has not spoken "
+            "yet, seconds.",
+        )
+        self._relays = base.flag(
+            "relay_observations",
+            False,
+            "Relay /<robot>/observation to /<robot>/observation_seen, which policies then have to "
+            "listen to: what observation faults need.",
+        )
+        self._state = GateState(len(robots), lockstep, first_lease_s, self._relays)
         self._watched: set[int] = set()
-        self._events = self.create_publisher(FaultEvent, "/coach/events", EVENTS)
+        self._watches_world = False
+        self._untold = [0] * len(robots)  # as /diagnostics said them last
         self._commands = [
-            self.create_publisher(Action, f"/{name}/command", NEWEST) for name in self._robots
+            base.command_publisher(robot, Action, NEWEST).publish for robot in range(len(robots))
         ]
-        for robot, name in enumerate(self._robots):
-            self.create_subscription(
+        self._seen = []
+        for robot, name in enumerate(robots):
+            base.create_subscription(
                 Action,
-                f"/{name}/command_raw",
+                f"/{name}/{base.raw_topic}",
                 partial(self._on_command, robot),
                 NEWEST,
                 raw=True,
             )
-        self.create_subscription(CrashPlan, "/coach/plan", self._on_plan, PLAN)
-        self.create_timer(TICK_S, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+            if self._relays:
+                self._seen.append(
+                    base.create_publisher(Observation, f"/{name}/observation_seen", NEWEST)
+                )
+                self._watch(robot)
+
+    # --- as Gate ----------------------------------------------------------------------------
+
+    @property
+    def book(self) -> PlanBook:
+        return self._state.book
+
+    def plan(self, plan: CrashPlan, lease_s: float, now_s: float) -> None:
+        outputs = self._state.plan(plan, lease_s, now_s)
+        if outputs:
+            for robot in self._state.watched_robots - self._watched:
+                self._watch(robot)
+            if self._state.needs_world and not self._watches_world:
+                self._watches_world = True
+                self._base.create_subscription(
+                    EpisodeState, "/sim/episode", self._on_episode, EPISODE
+                )
+        self._send(outputs)
+
+    def tick(self, now_s: float) -> None:
+        self._send(self._state.tick(now_s))
+
+    def decided(self) -> Sequence[Decided]:
+        decisions = [self._state.last(robot) for robot in range(len(self._base.robots))]
+        return [
+            Decided() if d is None else Decided(d.mode, d.command.episode, d.command.step)
+            for d in decisions
+        ]
+
+    def counters(self, robot: int) -> Sequence[tuple[str, int]]:
+        return (("late", self._state.late[robot]), ("untold", self._state.untold[robot]))
+
+    def warning(self, robot: int) -> str:
+        before, self._untold[robot] = self._untold[robot], self._state.untold[robot]
+        if self._untold[robot] == before:
+            return ""
+        return "its policy does not tell its worst action: commands are withheld"
+
+    def close(self) -> None:
+        """Nothing is open that the node does not close."""
+
+    # --- relaying ---------------------------------------------------------------------------
+
+    def _watch(self, robot: int) -> None:
+        """Availability is needed from the first fault of a robot that asks for it on."""
+        self._watched.add(robot)
+        self._base.create_subscription(
+            Observation,
+            f"/{self._base.robots[robot]}/observation",
+            partial(self._on_observation, robot),
+            NEWEST,
+            raw=True,
+        )
 
     def _on_command(self, robot: int, data: bytes) -> None:
+        now_s = time.monotonic()
+        self._base.health.heard(robot, now_s)
         try:
             command = command_from_bytes(robot, data)
         except UserError as error:
-            self.get_logger().error(f"{self._robots[robot]}: {error}; ignored")
+            self._base.get_logger().error(f"{self._base.robots[robot]}: {error}; ignored")
             return
-        self._send(self._state.command(command, time.monotonic()))
+        self._send(self._state.command(command, now_s))
 
-    def _on_plan(self, message: CrashPlan) -> None:
+    def _on_observation(self, robot: int, data: bytes) -> None:
         try:
-            plan = plan_from_message(message, self._robots)
-        except ValueError as error:
-            self.get_logger().error(f"plan {message.revision} refused: {error}")
+            sight = sight_from_bytes(robot, data)
+        except UserError as error:
+            self._base.get_logger().error(f"{self._base.robots[robot]}: {error}; ignored")
             return
-        outputs = self._state.plan(plan, message.lease_s, time.monotonic())
-        self._watch_observations()
-        self._send(outputs)
+        self._send(self._state.observation(sight, time.monotonic()))
 
-    def _watch_observations(self) -> None:
-        """Availability is needed from the first random fault of a robot on."""
-        for robot in self._state.randomised_robots - self._watched:
-            self._watched.add(robot)
-            self.create_subscription(
-                Observation,
-                f"/{self._robots[robot]}/observation",
-                partial(self._on_observation, robot),
-                NEWEST,
+    def _on_episode(self, message: EpisodeState) -> None:
+        world = world_from_message(message)
+        if len(world.positions_m) != len(self._base.robots):
+            self._base.get_logger().error(
+                f"/sim/episode has {len(world.positions_m)} robots, the gate "
+                f"{len(self._base.robots)}; ignored"
             )
-
-    def _on_observation(self, robot: int, message: Observation) -> None:
-        available = np.frombuffer(message.available_actions, dtype=np.uint8) != 0
-        now_s = time.monotonic()
-        self._send(self._state.observation(robot, message.episode, message.step, available, now_s))
-
-    def _on_tick(self) -> None:
-        self._send(self._state.tick(time.monotonic()))
+            return
+        self._send(self._state.world(message.episode, message.step, world, time.monotonic()))
 
     def _send(self, outputs: Outputs) -> None:
         for output in outputs:
             if isinstance(output, Decision):
                 self._send_decision(output)
-                continue
-            if output.kind == EventKind.EXPIRED:
-                self.get_logger().warning("the coach is silent: every fault is cleared")
-            stamp = self.get_clock().now().to_msg()
-            self._events.publish(message_from_event(output, stamp))
+            elif isinstance(output, Seen):
+                self._seen[output.sight.robot].publish(bytes_from_seen(output))
+            else:
+                self._base.send_events((output,))
 
     def _send_decision(self, decision: Decision) -> None:
-        withheld = decision.applied == NOTHING_APPLIED
+        withheld = decision.applied == WITHHELD
         if not withheld:
-            self._commands[decision.command.robot].publish(bytes_from_decision(decision))
+            self._commands[decision.command.robot](bytes_from_decision(decision))
         # Repeated only where the receiver has nothing else to go by: one EFFECT per robot-step.
-        if withheld or (decision.mode != Mode.NONE and not decision.repeated):
-            self._events.publish(effect_from_decision(decision, self._robots))
+        if withheld or (decision.mode and not decision.observation and not decision.repeated):
+            self._base.send_effect(effect_from_decision(decision, self._base.robots))
 
 
 def start(executor: Executor) -> Node:
     """A gate on ``executor``."""
-    node = GateNode()
-    executor.add_node(node)
-    return node
+    base = GateBase()
+    try:
+        base.serve(_attach(base))
+    except UserError:
+        base.destroy_node()
+        raise
+    executor.add_node(base)
+    return base
+
+
+def _attach(base: GateBase) -> Gate:
+    if base.command_type == ACTION_TYPE:
+        return ActionGate(base)
+    raise UserError(f"parameter 'command_type' {base.command_type!r} is not {ACTION_TYPE}")
 
 
 def main() -> int:

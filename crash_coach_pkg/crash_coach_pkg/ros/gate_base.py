@@ -1,0 +1,239 @@
+"""What every gate does, whatever its robots' commands are: plans, events, telemetry."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from typing import Protocol
+
+from crash_coach_interfaces.msg import CrashPlan as CrashPlanMessage
+from crash_coach_interfaces.msg import FaultEvent
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rclpy.clock import Clock, ClockType
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from crash_coach_pkg.health import Decided, Report, RobotState, TeamHealth
+from crash_coach_pkg.plan import CrashPlan
+from crash_coach_pkg.plan_book import Event, EventKind, PlanBook
+from crash_coach_pkg.ros.convert import message_from_event, message_from_plan, plan_from_message
+from crash_coach_pkg.ros.endpoints import WatchedPublisher
+from crash_coach_pkg.ros.run import EVENTS, PLAN, TICK_S, refuse_unknown_parameters, robot_names
+from sim_pkg.contract import UserError
+
+ACTION_TYPE = "crash_coach_interfaces/msg/Action"
+DIAGNOSTICS_S = 1.0
+_LEVELS = {
+    RobotState.OK: DiagnosticStatus.OK,
+    RobotState.MUTED: DiagnosticStatus.WARN,
+    RobotState.LOST: DiagnosticStatus.ERROR,
+}
+
+
+class Gate(Protocol):
+    """What is attached to a GateBase: it relays one type of commands."""
+
+    @property
+    def book(self) -> PlanBook: ...
+
+    def plan(self, plan: CrashPlan, lease_s: float, now_s: float) -> None:
+        """Takes a plan or its heartbeat, and sends what follows from it."""
+        ...
+
+    def tick(self, now_s: float) -> None:
+        """Every TICK_S of a steady clock; ends leases."""
+        ...
+
+    def decided(self) -> Sequence[Decided]:
+        """The newest robot-step of each robot, for /diagnostics."""
+        ...
+
+    def counters(self, robot: int) -> Sequence[tuple[str, int]]:
+        """What else /diagnostics tells of a robot."""
+        ...
+
+    def warning(self, robot: int) -> str:
+        """What an operator should know of a robot beside its state; empty: nothing."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class GateBase(Node):
+    """Parameters: robots, command_type, raw_topic, command_topic, cmd_timeout_s.
+
+    What is attached declares its own, before ``serve`` refuses those that nobody declared.
+
+    Raises:
+        UserError: a parameter is missing or wrong.
+    """
+
+    def __init__(self, context: Context | None = None) -> None:
+        super().__init__("gate", context=context)
+        self.robots = robot_names(self)
+        self.command_type = self.text(
+            "command_type", ACTION_TYPE, "Type of the robots' commands: package/msg/Type."
+        )
+        actions = self.command_type == ACTION_TYPE
+        self.raw_topic = self.text(
+            "raw_topic",
+            "command_raw" if actions else "cmd_vel_raw",
+            "What is relayed: /<robot>/<this>.",
+        )
+        self.command_topic = self.text(
+            "command_topic",
+            "command" if actions else "cmd_vel",
+            "Where it is relayed to: /<robot>/<this>.",
+        )
+        cmd_timeout_s = self.number(
+            "cmd_timeout_s",
+            1.0,
+            (0.001, 3600.0),
+            "/diagnostics calls a robot lost when no command came for so long, seconds.",
+        )
+        self.health = TeamHealth(len(self.robots), cmd_timeout_s)
+        self._gate: Gate | None = None
+        self._unreadable: int | None = None  # revision of the plan that was refused last
+        self._outputs: list[tuple[int, WatchedPublisher]] = []
+        self._events = self.create_publisher(FaultEvent, "/coach/events", EVENTS)
+        self._in_force = self.create_publisher(CrashPlanMessage, "/coach/plan_in_force", PLAN)
+        self._diagnostics = self.create_publisher(
+            DiagnosticArray, "/diagnostics", QoSProfile(depth=10)
+        )
+
+    # --- for what is attached ---------------------------------------------------------------
+
+    def text(self, name: str, default: str, description: str) -> str:
+        """Declares a read-only parameter. Raises UserError where it is empty."""
+        descriptor = ParameterDescriptor(description=description, read_only=True)
+        value: str = self.declare_parameter(name, default, descriptor).value
+        if not value:
+            raise UserError(f"parameter {name!r} of {self.get_name()} is empty")
+        return value
+
+    def number(
+        self, name: str, default: float, limits: tuple[float, float], description: str
+    ) -> float:
+        """Declares a read-only parameter within ``limits``."""
+        low, high = limits
+        descriptor = ParameterDescriptor(
+            description=description,
+            read_only=True,
+            floating_point_range=[FloatingPointRange(from_value=low, to_value=high)],
+        )
+        value: float = self.declare_parameter(name, default, descriptor).value
+        return value
+
+    def flag(self, name: str, default: bool, description: str) -> bool:
+        """Declares a read-only parameter."""
+        descriptor = ParameterDescriptor(description=description, read_only=True)
+        value: bool = self.declare_parameter(name, default, descriptor).value
+        return value
+
+    def command_publisher(self, robot: int, type_: type, qos: QoSProfile) -> WatchedPublisher:
+        """Publishes what ``robot`` gets; others that do so too are reported as intruders."""
+        topic = f"/{self.robots[robot]}/{self.command_topic}"
+        publisher = WatchedPublisher(self, type_, topic, qos)
+        self._outputs.append((robot, publisher))
+        return publisher
+
+    def serve(self, gate: Gate) -> None:
+        """Carries out plans with ``gate`` from now on.
+
+        Raises:
+            UserError: a parameter that neither this node nor the gate has declared.
+        """
+        refuse_unknown_parameters(self)
+        self._gate = gate
+        self.create_subscription(CrashPlanMessage, "/coach/plan", self._on_plan, PLAN)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(TICK_S, lambda: gate.tick(time.monotonic()), clock=steady)
+        self.create_timer(DIAGNOSTICS_S, lambda: self._on_diagnostics(gate), clock=steady)
+
+    def send_events(self, events: Iterable[Event]) -> None:
+        """To /coach/events; a plan that they change to /coach/plan_in_force."""
+        for event in events:
+            stamp = self.get_clock().now().to_msg()
+            self._events.publish(message_from_event(event, self.robots, stamp))
+            if event.kind in (EventKind.ARMED, EventKind.EXPIRED):
+                self._tell_plan()
+            if event.kind == EventKind.EXPIRED:
+                self.get_logger().warning("the coach is silent: every fault is cleared")
+            elif event.kind == EventKind.REFUSED:
+                self.get_logger().error(f"plan {event.revision} refused: {event.detail}")
+
+    def send_effect(self, message: FaultEvent) -> None:
+        self._events.publish(message)
+
+    # --- plans and telemetry ----------------------------------------------------------------
+
+    def _on_plan(self, message: CrashPlanMessage) -> None:
+        assert self._gate is not None  # subscribed in ``serve``
+        try:
+            plan = plan_from_message(message, self.robots)
+        except UserError as error:
+            if message.revision != self._unreadable:  # not again with every heartbeat
+                self._unreadable = message.revision
+                kind, step = EventKind.REFUSED, self._gate.book.next_step
+                self.send_events(
+                    [Event(kind, message.episode, step, message.revision, detail=str(error))]
+                )
+            return
+        self._gate.plan(plan, message.lease_s, time.monotonic())
+
+    def _tell_plan(self) -> None:
+        assert self._gate is not None
+        book, stamp = self._gate.book, self.get_clock().now().to_msg()
+        self._in_force.publish(message_from_plan(book.in_force, self.robots, book.lease_s, stamp))
+
+    def _on_diagnostics(self, gate: Gate) -> None:
+        self._look_for_intruders(gate)
+        message = DiagnosticArray()
+        message.header.stamp = self.get_clock().now().to_msg()
+        for report in self.health.reports(gate.decided(), time.monotonic()):
+            message.status.append(self._status(gate, report))
+        self._diagnostics.publish(message)
+
+    def _status(self, gate: Gate, report: Report) -> DiagnosticStatus:
+        warning = gate.warning(report.robot)
+        level, values = _LEVELS[report.state], dict(report.values)
+        if level == DiagnosticStatus.OK and (warning or "intruders" in values):
+            level = DiagnosticStatus.WARN
+        counters = (*gate.counters(report.robot), ("ignored_plans", gate.book.ignored))
+        values |= {key: str(value) for key, value in counters}
+        name = self.robots[report.robot]
+        return DiagnosticStatus(
+            level=level,
+            name=f"gate: {name}",
+            message="; ".join(text for text in (report.text, warning) if text),
+            hardware_id=name,
+            values=[KeyValue(key=key, value=value) for key, value in values.items()],
+        )
+
+    def _look_for_intruders(self, gate: Gate) -> None:
+        decided = gate.decided()
+        for robot, output in self._outputs:
+            sighting = output.look()
+            self.health.intruders(robot, tuple(str(who) for who in output.intruders))
+            at, revision = decided[robot], gate.book.revision
+            count = len(output.intruders) + 1
+            self.send_events(
+                Event(
+                    EventKind.INTRUDER,
+                    at.episode,
+                    at.step,
+                    revision,
+                    robot,
+                    detail=f"{who} publishes on {output.topic} too ({count} publishers)",
+                )
+                for who in sighting.appeared
+            )
+            for who in sighting.appeared:
+                self.get_logger().warning(f"{who} publishes on {output.topic}, beside this gate")
+
+    def destroy_node(self) -> None:
+        if self._gate is not None:
+            self._gate.close()
+        super().destroy_node()
