@@ -21,17 +21,17 @@ def _splitmix64(x: UInt64Array) -> UInt64Array:
 
 
 def random_bits(
-    seed: int,
+    seed: npt.ArrayLike,
     episode: npt.ArrayLike,
     step: npt.ArrayLike,
     robot: npt.ArrayLike,
     stream: int = 0,
 ) -> UInt64Array:
-    """64 uniform bits for each (episode, step, robot); these broadcast together, at least 1-d.
+    """64 uniform bits for each (seed, episode, step, robot); they broadcast, at least 1-d.
 
     ``stream`` keeps different uses of one key apart; 0 is the random actions'.
     """
-    key = _splitmix64(np.atleast_1d(np.uint64(seed)))
+    key = _splitmix64(np.atleast_1d(np.asarray(seed, dtype=np.uint64)))
     for counter in (episode, step, robot):
         key = _splitmix64(key ^ np.asarray(counter).astype(np.uint64))
     return _splitmix64(key ^ np.uint64(stream)) if stream else key

@@ -29,7 +29,7 @@ def apply_faults(
     modes: npt.NDArray[np.uint8],
     available: BoolArray,
     stay: IntArray,
-    seed: int,
+    seed: npt.ArrayLike,
     episode: EpisodeArray,
     step: EpisodeArray,
 ) -> IntArray:
@@ -40,7 +40,7 @@ def apply_faults(
         modes: (B, n) code of the fault in force: 0, MUTE_CODE or RANDOM_CODE.
         available: (B, n, A).
         stay: (B, n) the no-move action of each robot: what a muted robot executes.
-        seed, episode, step: keys of the random actions; episode and step are (B,).
+        seed, episode, step: keys of the random actions; seed is one or (B, 1), the others (B,).
 
     Returns:
         (B, n) int32.

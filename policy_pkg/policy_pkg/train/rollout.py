@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from crash_coach_pkg.plan import CrashPlan, Fault, Mode
+from crash_coach_pkg.action_tools import UNTOLD
+from crash_coach_pkg.plan import CrashPlan, Fault, Trigger, TriggerKind
 from policy_pkg.act import epsilon_greedy
 from policy_pkg.checkpoint import CheckpointError
 from policy_pkg.policy import RecurrentPolicy
-from policy_pkg.train.arenas import ArenaArray, Arenas, ModeArray
+from policy_pkg.train.arenas import ArenaArray, Arenas, Executed
 from policy_pkg.train.episode import Episode
 from policy_pkg.train.teams import RecurrentTeam
-from sim_pkg.contract import BatchEnv, StepResult
+from sim_pkg.contract import BatchEnv, FloatArray, IntArray, StepResult
 
 Array = npt.NDArray[Any]
 
@@ -66,6 +67,9 @@ class Rollout:
         self._available = np.zeros((b, t + 1, n, spec.n_actions), dtype=np.bool_)
         self._actions = np.zeros((b, t, n), dtype=np.int32)
         self._reward = np.zeros((b, t), dtype=np.float32)
+        # What the episodes under way are played again from after a checkpoint.
+        self._intents = np.zeros((b, t, n), dtype=np.int32)
+        self._worst = np.full((b, t, n), UNTOLD, dtype=np.int32)
         self._faults = np.zeros((b, t, n), dtype=np.uint8)
 
     @property
@@ -79,11 +83,15 @@ class Rollout:
             The episodes that it ended, in ascending order of their arenas.
         """
         self._start_waiting()
-        q = self._team.values(self._env.obs, self._arenas.last_action)
+        seen = self._arenas.sense()
+        q = self._team.values(seen, self._arenas.last_action)
         intent = epsilon_greedy(q, self._env.available, epsilon, self._rng)
-        self._record_before()
-        done = self._arenas.execute(intent)
-        ended = self._record_after(done.actions, done.modes, done.result)
+        self._record_before(seen, intent)
+        worst = self._arenas.worst()
+        if worst is not None:
+            self._worst[self._index, self._arenas.steps] = worst
+        done = self._arenas.execute(intent, worst)
+        ended = self._record_after(done)
         self._waiting = ended
         return [self._finished(int(arena), done.result) for arena in ended]
 
@@ -96,23 +104,25 @@ class Rollout:
             )
             self._next_episode += count
 
-    def _record_before(self) -> None:
+    def _record_before(self, seen: FloatArray, intent: IntArray) -> None:
+        """Writes what the team saw and wanted."""
         steps = self._arenas.steps
-        self._obs[self._index, steps] = self._env.obs
+        self._obs[self._index, steps] = seen
+        self._intents[self._index, steps] = intent
         self._state[self._index, steps] = self._env.state
         self._available[self._index, steps] = self._env.available
 
-    def _record_after(self, actions: Array, modes: ModeArray, result: StepResult) -> ArenaArray:
+    def _record_after(self, done: Executed) -> ArenaArray:
         """Writes what was executed and what came of it; returns the arenas that ended."""
         steps = self._arenas.steps
-        self._actions[self._index, steps] = actions
-        self._faults[self._index, steps] = modes
-        self._reward[self._index, steps] = result.reward
-        return self._arenas.count_step(result)
+        self._actions[self._index, steps] = done.actions
+        self._faults[self._index, steps] = done.modes
+        self._reward[self._index, steps] = done.result.reward
+        return self._arenas.count_step(done.result)
 
     def _finished(self, arena: int, result: StepResult) -> Finished:
         length = int(self._arenas.steps[arena])
-        self._obs[arena, length] = self._env.obs[arena]
+        self._obs[arena, length] = self._arenas.sense_end(arena)
         self._state[arena, length] = self._env.state[arena]
         self._available[arena, length] = self._env.available[arena]
         episode = Episode(
@@ -132,12 +142,14 @@ class Rollout:
     def state_dict(self) -> tuple[dict[str, Array], dict[str, Any]]:
         """What continues the episodes under way bit for bit: arrays, and JSON values.
 
-        The environment itself is not saved: its episodes are played again from their actions.
+        The environment itself is not saved: its episodes are played again from what the
+        team wanted, so that faults go through the same states.
         """
         arenas = self._arenas
         arrays = {
             "steps": np.where(arenas.running, arenas.steps, -1),
-            "actions": self._actions,
+            "intents": self._intents,
+            "worst": self._worst,
             "hidden": self._team.hidden,
             "obs": np.ascontiguousarray(self._env.obs),
         }
@@ -151,10 +163,15 @@ class Rollout:
         Raises:
             CheckpointError: the environment does not repeat what was seen.
         """
+        if "intents" not in arrays:
+            raise CheckpointError(
+                "it was written by an earlier version, which kept no intended actions: its policy "
+                "can be evaluated, but its training cannot be continued"
+            )
         steps = arrays["steps"]
         plans = [None if p is None else plan_from_json(p) for p in values["plans"]]
         running = [plan if at >= 0 else None for plan, at in zip(plans, steps, strict=True)]
-        self._replay(steps, running, arrays["actions"])
+        self._replay(steps, running, arrays["intents"], arrays["worst"])
         if not np.array_equal(self._env.obs[steps >= 0], arrays["obs"][steps >= 0]):
             raise CheckpointError(
                 f"scenario {self._env.spec.scenario!r} does not repeat the episodes under way in "
@@ -165,7 +182,9 @@ class Rollout:
         self._next_episode = int(values["next_episode"])
         self._rng.bit_generator.state = values["rng"]
 
-    def _replay(self, steps: Array, plans: list[CrashPlan | None], actions: Array) -> None:
+    def _replay(
+        self, steps: Array, plans: list[CrashPlan | None], intents: Array, worst: Array
+    ) -> None:
         """Arenas start one after another, so that all arrive at their step together."""
         arenas = self._arenas
         longest = int(steps.max(initial=0))
@@ -174,10 +193,11 @@ class Rollout:
             arenas.start_planned(starting, [p for i in starting if (p := plans[i]) is not None])
             if remaining == 0:
                 return
-            self._record_before()
-            executed = actions[self._index, arenas.steps]
-            done = arenas.advance(executed, arenas.current_modes())
-            if len(self._record_after(done.actions, done.modes, done.result)):
+            seen, intent = arenas.sense(), intents[self._index, arenas.steps]
+            self._record_before(seen, intent)
+            told = worst[self._index, arenas.steps]
+            self._worst[self._index, arenas.steps] = told
+            if len(self._record_after(arenas.execute(intent, told))):
                 raise CheckpointError(
                     f"scenario {self._env.spec.scenario!r} ends an episode earlier than it did "
                     "when this checkpoint was written"
@@ -189,5 +209,12 @@ def plan_to_json(plan: CrashPlan) -> dict[str, Any]:
 
 
 def plan_from_json(values: dict[str, Any]) -> CrashPlan:
-    faults = tuple(Fault(**{**f, "mode": Mode(f["mode"])}) for f in values["faults"])
+    faults = tuple(_fault_from_json(fault) for fault in values["faults"])
     return CrashPlan(**{**values, "faults": faults})
+
+
+def _fault_from_json(values: dict[str, Any]) -> Fault:
+    parameters = tuple((name, value) for name, value in values["parameters"])
+    kind, numbers = TriggerKind(values["trigger"]["kind"]), values["trigger"]["values"]
+    trigger = Trigger(kind, tuple(numbers))
+    return Fault(**{**values, "parameters": parameters, "trigger": trigger})

@@ -7,7 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from crash_coach_pkg.action_tools import ACTION_OFFERS
 from crash_coach_pkg.coach import Coach
+from crash_coach_pkg.config import TeamSpec
+from crash_coach_pkg.faults import unmet_needs
 from crash_coach_pkg.strategies import Progress
 from policy_pkg.policy import RecurrentPolicy
 from policy_pkg.train.config import TrainConfig
@@ -75,7 +78,7 @@ class Session:
     def __post_init__(self) -> None:
         config, spec = self.config, self.env.spec
         try:
-            self.coach = Coach(config.coach, spec.robots, config.seed)
+            self.coach = Coach(config.coach, TeamSpec.of(spec), config.seed)
         except ValueError as error:
             raise UserError(f"coach of scenario {spec.scenario!r}: {error}") from error
         if self.coach.needs_success and not spec.reports_success:
@@ -83,6 +86,8 @@ class Session:
                 f"scenario {spec.scenario!r} reports no success, which coach.strategy = "
                 f"{config.coach.strategy!r} needs; use none, fixed or curriculum"
             )
+        if reason := unmet_needs(config.coach.crash_mode, ACTION_OFFERS):
+            raise UserError(f"coach of scenario {spec.scenario!r}: {reason}")
         sizes = Sizes.of(spec)
         self.learner = Learner(config.learner, sizes, config.seed)
         self.policy = RecurrentPolicy(self.learner.agent_weights(), spec.n_robots, spec.n_actions)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
-from policy_pkg.act import greedy
+from crash_coach_pkg.action_tools import ACTION_OFFERS
+from crash_coach_pkg.faults.base import Need
+from policy_pkg.act import greedy, least_valued
 from policy_pkg.policy import RecurrentPolicy
 from sim_pkg.contract import BatchEnv, BoolArray, EpisodeArray, FloatArray, IntArray
 from sim_pkg.scripted import ScriptedPolicy
@@ -28,6 +30,20 @@ class Team(Protocol):
         ...
 
 
+@runtime_checkable
+class ValuingTeam(Team, Protocol):
+    """A team that knows what its actions are worth."""
+
+    def worst(self, available: BoolArray) -> IntArray:
+        """(B, n) the available action that each robot valued least when it last acted."""
+        ...
+
+
+def offers(team: Team) -> frozenset[Need]:
+    """What fault modes may ask of this team's commands."""
+    return ACTION_OFFERS if isinstance(team, ValuingTeam) else ACTION_OFFERS - {"worst"}
+
+
 class RecurrentTeam:
     """A trained policy; ``hidden`` is (B * n, H). The policy's weights may change."""
 
@@ -37,6 +53,7 @@ class RecurrentTeam:
         self._shape = (b, n)
         self._robot: IntArray = np.tile(np.arange(n, dtype=np.int32), b)
         self.hidden = policy.initial_hidden(b * n)
+        self._values: FloatArray = np.zeros((b, n, policy.sizes.actions), dtype=np.float32)
 
     def begin(self, arenas: npt.NDArray[np.intp], seed: int, episodes: EpisodeArray) -> None:
         self.hidden.reshape(self._shape[0], -1)[arenas] = 0.0
@@ -47,11 +64,15 @@ class RecurrentTeam:
         q, self.hidden = self._policy.forward(
             obs.reshape(b * n, -1), last_action.reshape(-1), self._robot, self.hidden
         )
-        return q.reshape(b, n, -1)
+        self._values = q.reshape(b, n, -1)
+        return self._values
 
     def act(self, obs: FloatArray, available: BoolArray, last_action: IntArray) -> IntArray:
         """Greedily."""
         return greedy(self.values(obs, last_action), available)
+
+    def worst(self, available: BoolArray) -> IntArray:
+        return least_valued(self._values, available)
 
 
 class ScriptedTeam:
