@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -15,6 +15,9 @@ from policy_pkg.train.learner_config import LearnerConfig
 from sim_pkg.config import ConfigError, YamlTree, did_you_mean, load_tree, validate
 
 CONFIGS_DIR = Path(__file__).parent.parent / "configs"
+OFFLINE = "offline"  # its folder is that of `train-offline`
+
+ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
 class TrainConfig(BaseModel):
@@ -94,18 +97,36 @@ class _Overridden(YamlTree):
         return " with --set ".join([super().where(location), *inside])
 
 
+def config_names(offline: bool) -> tuple[str, ...]:
+    """Names of the shipped configs of `train`, or of `train-offline`; sorted."""
+    files = (file.relative_to(CONFIGS_DIR) for file in CONFIGS_DIR.rglob("*.yaml"))
+    chosen = (file for file in files if (file.parts[0] == OFFLINE) is offline)
+    return tuple(sorted(file.with_suffix("").as_posix() for file in chosen))
+
+
 def train_config_names() -> tuple[str, ...]:
     """Names of the shipped training configs, such as ``buttons/qmix``; sorted."""
-    files = CONFIGS_DIR.rglob("*.yaml")
-    return tuple(sorted(f.relative_to(CONFIGS_DIR).with_suffix("").as_posix() for f in files))
+    return config_names(offline=False)
 
 
 def load_train_config(
     source: str | Path, overrides: Sequence[str] = (), seed: int | None = None
 ) -> TrainConfig:
-    """Reads a training config.
+    """Reads a training config; as ``load_config``."""
+    return load_config(TrainConfig, train_config_names(), source, overrides, seed)
+
+
+def load_config(
+    model: type[ModelT],
+    known: tuple[str, ...],
+    source: str | Path,
+    overrides: Sequence[str],
+    seed: int | None,
+) -> ModelT:
+    """Reads a config of ``model``, which has a key ``seed``.
 
     Args:
+        known: names of the shipped ones.
         source: a shipped config's name, with or without ``.yaml``, or a path.
         overrides: ``key=value`` or ``section.key=value``; values are read as YAML.
         seed: replaces the config's.
@@ -113,16 +134,15 @@ def load_train_config(
     Raises:
         ConfigError: names the file and line or the override, the key, the value, what is right.
     """
-    tree = load_tree(_find(source))
+    tree = load_tree(_find(source, known))
     given: dict[tuple[str, ...], str] = {}
     for text in [*overrides, *([] if seed is None else [f"seed={seed}"])]:
         keys = _apply(tree.values, text)
         given[keys] = text
-    return validate(_Overridden(tree.path, tree.values, tree.lines, given), TrainConfig)
+    return validate(_Overridden(tree.path, tree.values, tree.lines, given), model)
 
 
-def _find(source: str | Path) -> Path:
-    known = train_config_names()
+def _find(source: str | Path, known: tuple[str, ...]) -> Path:
     name = str(source).removesuffix(".yaml")
     if name in known and not Path(source).is_file():
         return CONFIGS_DIR / f"{name}.yaml"

@@ -6,7 +6,11 @@
 
 as in double Q-learning (van Hasselt et al. 2016) with QMIX's Q_tot; VDN's is the sum of the robots'
 values (Sunehag et al. 2018); IQL has no mixer: each robot gets the team's reward and the mean runs
-over steps and robots.
+over steps and robots. On fixed data a conservative term is added, conservative_weight times
+
+    mean over robot-steps of logsumexp_a Q(o, a; online) - Q(o, a_data; online)
+
+that keeps actions which the data lack from being overvalued (CQL, Kumar et al. 2020).
 
 The networks and their gradients are written out in numpy: at these sizes autograd's book-keeping
 costs as much as the arithmetic. torch does the optimiser's step. Thread counts are the process's
@@ -21,12 +25,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 from numba import njit
 
 from policy_pkg.train import agent_net, mixer
+from policy_pkg.train.cross_entropy import cross_entropy, robot_step_weights
 from policy_pkg.train.episode import Sizes
 from policy_pkg.train.learner_config import LearnerConfig
+from policy_pkg.train.optimiser import Optimiser, check_arrays
 from policy_pkg.train.packed_gru import Schedule
 from policy_pkg.train.parameters import FlatParameters, Shapes, initial_values, part
 from policy_pkg.train.replay import Batch
@@ -71,41 +76,42 @@ class Learner:
         self._agent, self._mixer = _parts(self._online.named)
         self._target_agent, self._target_mixer = _parts(self._target.named)
         self._agent_gradients, self._mixer_gradients = _parts(self._online.named_gradients)
-        self._torch_flat = torch.from_numpy(self._online.flat).requires_grad_()
-        self._torch_flat.grad = torch.from_numpy(self._online.gradient)
-        self._optimiser = _optimiser(config, self._torch_flat)
+        self._optimiser = Optimiser(config, self._online)
 
-    def update(self, batch: Batch, *, episodes: int) -> dict[str, float]:
+    def update(
+        self, batch: Batch, *, episodes: int, weights: Array | None = None
+    ) -> dict[str, float]:
         """One gradient step; then the target copy when it is due.
 
         episodes: finished training episodes so far, which the target copies are counted in.
+        weights: (B,) factor of each of the batch's episodes in the loss; None: 1.
         Returns loss, grad_norm (before clipping), and the means over valid steps of |TD error|,
-        Q of the taken actions and target (of the team; for iql per robot).
+        Q of the taken actions and target (of the team; for iql per robot); with a
+        conservative_weight the term conservative, which the loss contains that many times.
 
         Raises:
             DivergedError: loss or gradient is not finite.
         """
         with np.errstate(invalid="ignore", over="ignore"):  # told by the check below
-            metrics = self._gradient(batch)
-        gradient = self._online.gradient
-        norm = math.sqrt(float(gradient @ gradient))
+            metrics = self._gradient(batch, weights)
+        norm = self._optimiser.gradient_norm()
         if not (math.isfinite(metrics["loss"]) and math.isfinite(norm)):
             raise DivergedError(batch.copy(), metrics["loss"], norm, self.updates)
-        if norm > self.config.grad_norm_clip:
-            gradient *= self.config.grad_norm_clip / (norm + 1e-6)
-        self._optimiser.step()
+        self._optimiser.step(norm)
         self.updates += 1
         if episodes - self._copied_at_episode >= self.config.target_update_interval_episodes:
             self._target.flat[:] = self._online.flat
             self._copied_at_episode = episodes
         return {**metrics, "grad_norm": norm}
 
-    def loss_and_gradients(self, batch: Batch) -> tuple[float, Arrays]:
+    def loss_and_gradients(
+        self, batch: Batch, weights: Array | None = None
+    ) -> tuple[float, Arrays]:
         """Loss and its gradient by parameter name (copies); changes nothing."""
-        loss = self._gradient(batch)["loss"]
+        loss = self._gradient(batch, weights)["loss"]
         return loss, {name: grad.copy() for name, grad in self._online.named_gradients.items()}
 
-    def _gradient(self, batch: Batch) -> dict[str, float]:
+    def _gradient(self, batch: Batch, weights: Array | None) -> dict[str, float]:
         """Fills the gradient of every parameter; returns loss and means."""
         n = self.sizes.n_robots
         first = int(batch.alive[0])
@@ -123,20 +129,31 @@ class Learner:
             state = self._cast(batch.state)
             value, mixed = mixer.qmix(self._mixer, taken, state[batch.now])
             following, _ = mixer.qmix(self._target_mixer, following, state[first:])
-            metrics, grad_value = self._error(batch, value, following)
+            metrics, grad_value = self._error(batch, value, following, weights)
             grad_taken = mixer.qmix_gradients(self._mixer, mixed, grad_value, self._mixer_gradients)
         elif self.config.algorithm == "vdn":
-            metrics, grad_value = self._error(batch, taken.sum(1), following.sum(1))
+            metrics, grad_value = self._error(batch, taken.sum(1), following.sum(1), weights)
             grad_taken = np.broadcast_to(grad_value[:, np.newaxis], taken.shape)
         else:
-            metrics, grad_taken = self._error(batch, taken, following)
+            metrics, grad_taken = self._error(batch, taken, following, weights)
         grad_q = np.zeros_like(q)
         grad_q[rows, batch.actions] = grad_taken
+        if self.config.conservative_weight > 0:
+            metrics |= self._conservative(batch, q, weights, metrics["loss"], grad_q)
         agent_net.gradients(self._agent, tape, grad_q, self._agent_gradients)
         return metrics
 
+    def _conservative(
+        self, batch: Batch, q: Array, weights: Array | None, loss: float, grad_q: Array
+    ) -> dict[str, float]:
+        """The conservative term and the ``loss`` with it; adds its gradient to ``grad_q``."""
+        factor = self.config.conservative_weight
+        mean = robot_step_weights(batch, self.config.crashed_conservative == "keep", weights)
+        term = cross_entropy(q, batch, mean, factor, grad_q)
+        return {"conservative": term, "loss": loss + factor * term}
+
     def _error(
-        self, batch: Batch, value: Array, following: Array
+        self, batch: Batch, value: Array, following: Array, weights: Array | None
     ) -> tuple[dict[str, float], Array]:
         """Loss and means, and the gradient of ``value``: (M,) of the team, for iql (M, n)."""
         steps = (-1,) + (1,) * (value.ndim - 1)
@@ -150,11 +167,15 @@ class Learner:
             count = max(1, int(np.count_nonzero(keep)))
             error, value, target = error * keep, value * keep, target * keep
         metrics = {
-            "loss": float(np.square(error).sum()) / count,
             "td_error_abs": float(np.abs(error).sum()) / count,
             "q_taken_mean": float(value.sum()) / count,
             "target_mean": float(target.sum()) / count,
         }
+        squared = np.square(error)
+        if weights is not None:
+            factor = self._cast(weights[batch.episode]).reshape(steps)
+            squared, error = squared * factor, error * factor
+        metrics["loss"] = float(squared.sum()) / count
         return metrics, error * (-2.0 / count)
 
     def _next_values(self, batch: Batch, q_online: Array, q_target: Array) -> Array:
@@ -172,7 +193,7 @@ class Learner:
             crashed = np.take_along_axis(q_target, stay[:, :, np.newaxis], 2)[:, :, 0]
         return np.where(batch.faults != 0, crashed, values)
 
-    def _cast(self, array: npt.NDArray[np.float32]) -> Array:
+    def _cast(self, array: Array) -> Array:
         return array.astype(self.dtype, copy=False)
 
     def agent_weights(self) -> Arrays:
@@ -182,8 +203,7 @@ class Learner:
     def state_dict(self) -> tuple[Arrays, Scalars]:
         """Everything needed to go on bit for bit: arrays (copies) by name, and JSON scalars."""
         arrays = {name: array.copy() for name, array in self._nets().items()}
-        state = self._optimiser.state[self._torch_flat]
-        arrays.update({f"optimiser.{k}": v.numpy().copy() for k, v in state.items()})
+        arrays.update(self._optimiser.state_dict())
         scalars: Scalars = {
             "algorithm": self.config.algorithm,
             "optimiser": self.config.optimiser,
@@ -211,25 +231,10 @@ class Learner:
                     f"learner state has {key} {scalars.get(key)}, "
                     f"this learner {getattr(self.config, key)}"
                 )
-        for name, array in self._nets().items():
-            given = arrays.get(name)
-            if given is None or given.shape != array.shape or given.dtype != array.dtype:
-                found = "nothing" if given is None else f"{given.dtype} {given.shape}"
-                raise ValueError(
-                    f"learner state {name}: {found}; must be {array.dtype} {array.shape}"
-                )
-        moments, size = part(arrays, "optimiser."), self._online.flat.size
-        expected = {} if scalars["updates"] == 0 else _moments(self.config, size)
-        if {name: array.shape for name, array in moments.items()} != expected:
-            raise ValueError(
-                f"learner state's optimiser arrays {sorted(moments)} do not fit "
-                f"{self.config.optimiser} over {size} parameters"
-            )
+        check_arrays(self._nets(), arrays)
+        self._optimiser.load_state_dict(arrays, int(scalars["updates"]))
         for name, array in self._nets().items():
             array[...] = arrays[name]
-        self._optimiser.state[self._torch_flat] = {
-            name: torch.from_numpy(array.copy()) for name, array in moments.items()
-        }
         self.updates = int(scalars["updates"])
         self._copied_at_episode = int(scalars["copied_at_episode"])
 
@@ -246,18 +251,6 @@ def _shapes(config: LearnerConfig, sizes: Sizes) -> tuple[Shapes, dict[str, int]
     shapes = {f"{net}.{k}": v for net, (named, _) in parts.items() for k, v in named.items()}
     fan_in = {f"{net}.{k}": v for net, (_, fans) in parts.items() for k, v in fans.items()}
     return shapes, fan_in
-
-
-def _moments(config: LearnerConfig, parameters: int) -> dict[str, tuple[int, ...]]:
-    """Shapes of the state that torch's optimiser keeps from its first step on."""
-    names = ("exp_avg", "exp_avg_sq") if config.optimiser == "adam" else ("square_avg",)
-    return {"step": (), **dict.fromkeys(names, (parameters,))}
-
-
-def _optimiser(config: LearnerConfig, flat: torch.Tensor) -> torch.optim.Optimizer:
-    if config.optimiser == "adam":
-        return torch.optim.Adam([flat], lr=config.lr, eps=config.optim_eps)
-    return torch.optim.RMSprop([flat], lr=config.lr, alpha=config.optim_alpha, eps=config.optim_eps)
 
 
 @njit(cache=True)

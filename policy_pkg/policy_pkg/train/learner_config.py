@@ -57,6 +57,17 @@ class LearnerConfig(BaseModel):
         description="next value of a crashed robot: best action, mean over the available "
         "actions (random crash), or the stay action's value",
     )
+    conservative_weight: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=1e6,
+        description="factor of the conservative term, for fixed data; 0: none",
+    )
+    crashed_conservative: Literal["keep", "drop"] = Field(
+        default="drop",
+        description="drop: crashed robot-steps do not enter the conservative term, since what "
+        "they executed was not the policy's choice",
+    )
 
     @model_validator(mode="after")
     def _drop_needs_iql(self) -> Self:

@@ -40,10 +40,22 @@ class Batch:
     actions: npt.NDArray[np.int64]  # (M, n)
     reward: npt.NDArray[np.float32]  # (M,)
     bootstrap: npt.NDArray[np.float32]  # (M,) 0 where the step terminated its episode, else 1
-    available_next: npt.NDArray[np.bool_]  # (M, n, A) at the step's end
+    available: npt.NDArray[np.bool_]  # (N, n, A)
     faults: npt.NDArray[np.uint8]  # (M, n)
     alive: npt.NDArray[np.int64]  # (L+1,) episodes that have an observation at t
     slots: npt.NDArray[np.int64]  # (B,) which stored episodes, longest first
+
+    @property
+    def available_next(self) -> npt.NDArray[np.bool_]:
+        """(M, n, A) available at each step's end."""
+        return self.available[int(self.alive[0]) :]
+
+    @property
+    def episode(self) -> npt.NDArray[np.int64]:
+        """(M,) which of the batch's episodes each step belongs to."""
+        counts = self.alive[1:]
+        starts = np.repeat(np.cumsum(counts) - counts, counts)
+        return np.arange(len(self.now)) - starts
 
     def copy(self) -> Batch:
         return replace(self, **{name: array.copy() for name, array in self.arrays().items()})
@@ -120,7 +132,7 @@ class Replay:
         return self.gather(rng.choice(len(self), size=batch, replace=False, shuffle=False))
 
     def gather(self, slots: npt.NDArray[np.int64]) -> Batch:
-        """The packed batch of the given stored episodes (0 <= slot < len)."""
+        """The packed batch of the given stored episodes (0 <= slot < len); one may come twice."""
         lengths = self._length[slots]
         order = np.argsort(-lengths, kind="stable")
         slots, lengths = slots[order], lengths[order]
@@ -132,7 +144,7 @@ class Replay:
             *(store["obs"], store["state"], store["available"], store["actions"]),
             *(store["reward"], store["faults"], self._terminated, self._length, slots, alive),
             *(out.inputs, out.state, out.now, out.actions, out.reward, out.bootstrap),
-            *(out.available_next, out.faults),
+            *(out.available, out.faults),
         )
         return out
 
@@ -146,7 +158,7 @@ class Replay:
             actions=self._buffer("actions", np.int64, (steps, n)),
             reward=self._buffer("reward", np.float32, (steps,)),
             bootstrap=self._buffer("bootstrap", np.float32, (steps,)),
-            available_next=self._buffer("available_next", np.bool_, (steps, n, sizes.n_actions)),
+            available=self._buffer("available", np.bool_, (rows, n, sizes.n_actions)),
             faults=self._buffer("faults", np.uint8, (steps, n)),
             alive=alive,
             slots=slots,
@@ -256,6 +268,7 @@ def _gather(
             out_state[row] = state[slot, t]
             out_inputs[row, :, :obs_size] = obs[slot, t]
             out_inputs[row, :, obs_size:] = 0.0
+            out_available[row] = available[slot, t]
             for robot in range(n):
                 out_inputs[row, robot, obs_size + n_actions + robot] = 1.0
                 if t > 0:
@@ -265,7 +278,6 @@ def _gather(
                 out_reward[step] = reward[slot, t - 1]
                 ended = terminated[slot] and t == length[slot]
                 out_bootstrap[step] = 0.0 if ended else 1.0
-                out_available[step] = available[slot, t]
                 for robot in range(n):
                     out_actions[step, robot] = actions[slot, t - 1, robot]
                     out_faults[step, robot] = faults[slot, t - 1, robot]
