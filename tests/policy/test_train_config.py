@@ -34,7 +34,8 @@ def keys(model: type[BaseModel]) -> dict[str, object]:
 
 def test_the_full_file_shows_every_key_with_its_default() -> None:
     def shape(values: dict[str, object]) -> dict[str, object]:
-        return {k: shape(v) if isinstance(v, dict) else None for k, v in values.items()}
+        # An empty mapping is a value: of crash_parameters, whose keys are the mode's.
+        return {k: shape(v) if v and isinstance(v, dict) else None for k, v in values.items()}
 
     tree = load_tree(SHIPPED / "buttons" / "qmix.yaml")
     assert shape(tree.values) == keys(TrainConfig)
