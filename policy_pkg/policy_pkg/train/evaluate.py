@@ -2,59 +2,77 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from crash_coach_pkg.coach import Coach
-from crash_coach_pkg.config import CoachConfig
-from crash_coach_pkg.plan import CrashPlan
+from crash_coach_pkg.coach import Coach, Planner
+from crash_coach_pkg.config import CoachConfig, TeamSpec
+from crash_coach_pkg.effects import EffectRow
+from crash_coach_pkg.faults import unmet_needs
 from policy_pkg.checkpoint import PolicyBundle
 from policy_pkg.policy import RecurrentPolicy
 from policy_pkg.train.arenas import ArenaArray, Arenas, Executed
 from policy_pkg.train.statistics import wilson
-from policy_pkg.train.teams import RecurrentTeam, ScriptedTeam, Team
-from sim_pkg.contract import BatchEnv, UserError
+from policy_pkg.train.teams import RecurrentTeam, ScriptedTeam, Team, offers
+from sim_pkg.contract import BatchEnv, EnvSpec, UserError
 from sim_pkg.env import Env, make_env
 from sim_pkg.frames import Frames, Recorder
 from sim_pkg.scripted import make_scripted
 from sim_pkg.trajectory import TrajectoryHash, combine
 
+Parameters = Mapping[str, float]
+NO_PARAMETERS: Parameters = MappingProxyType({})
+
 
 @dataclass(frozen=True)
 class Condition:
-    """Under which crashes a policy is evaluated."""
+    """Under which crashes of a coach a policy is evaluated."""
 
     name: str
     crash: CoachConfig
+
+
+@dataclass(frozen=True)
+class Planned:
+    """Crashes that something else than a coach plans, such as a fault scenario.
+
+    ``planner``: for a team and the evaluation's seed; raises UserError where it cannot.
+    """
+
+    name: str
+    planner: Callable[[TeamSpec, int], Planner]
 
 
 def crash_free() -> Condition:
     return Condition("crash-free", CoachConfig())
 
 
-def at_rate(rate: float, mode: str = "mute") -> Condition:
+def at_rate(rate: float, mode: str = "mute", parameters: Parameters = NO_PARAMETERS) -> Condition:
     """Every robot crashes on its own with probability ``rate``; no re-sampling (the paper's)."""
-    settings = {"crash_rate": rate, "crash_mode": mode, "resample": False}
-    return _fixed(f"rate {rate:g}", settings)
+    who = {"crash_rate": rate, "resample": False}
+    return _fixed(f"rate {rate:g}", who, mode, parameters)
 
 
-def exactly(count: int, mode: str = "mute") -> Condition:
+def exactly(count: int, mode: str = "mute", parameters: Parameters = NO_PARAMETERS) -> Condition:
     """``count`` uniformly drawn robots crash in every episode."""
-    return _fixed(f"{count} crashed", {"crashed_exactly": count, "crash_mode": mode})
+    return _fixed(f"{count} crashed", {"crashed_exactly": count}, mode, parameters)
 
 
-def named(victims: Sequence[str], mode: str = "mute") -> Condition:
+def named(
+    victims: Sequence[str], mode: str = "mute", parameters: Parameters = NO_PARAMETERS
+) -> Condition:
     """These robots crash in every episode."""
-    settings = {"victims": tuple(victims), "crash_mode": mode}
-    return _fixed(f"{', '.join(victims)} {mode}", settings)
+    return _fixed(f"{', '.join(victims)} {mode}", {"victims": tuple(victims)}, mode, parameters)
 
 
-def _fixed(name: str, settings: dict[str, Any]) -> Condition:
-    return Condition(name, CoachConfig.model_validate({"strategy": "fixed", **settings}))
+def _fixed(name: str, who: dict[str, Any], mode: str, parameters: Parameters) -> Condition:
+    how = {"strategy": "fixed", "crash_mode": mode, "crash_parameters": dict(parameters)}
+    return Condition(name, CoachConfig.model_validate({**how, **who}))
 
 
 @dataclass(frozen=True)
@@ -65,18 +83,23 @@ class EpisodeResult:
     success: bool
     episode_return: float  # undiscounted sum of the team's rewards
     steps: int
-    crashed: tuple[int, ...]  # indexes of the robots that the plan faults
+    crashed: tuple[int, ...]  # indexes of the robots that were faulted in some step
     trajectory_hash: str
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All episodes of one condition, in episode order."""
+    """All episodes of one condition, in episode order.
+
+    ``effects``: sorted, if asked for: ACTIVE and CLEARED where a stretch of a fault begins and ends
+    within its episode, EFFECT per robot-step with a command, or (OBSERVED) observation fault.
+    """
 
     condition: str
     robots: tuple[str, ...]
     seed: int
     episodes: tuple[EpisodeResult, ...]
+    effects: tuple[EffectRow, ...] = ()
 
     @property
     def success_rate(self) -> float:
@@ -113,25 +136,26 @@ class Scripted:
 def evaluate(
     target: PolicyBundle | RecurrentPolicy | Scripted,
     scenario: str | Path,
-    condition: Condition,
+    condition: Condition | Planned,
     episodes: int,
     seed: int,
     n_arenas: int = 32,
+    effects: bool = False,
 ) -> Evaluation:
     """Plays episodes 0 .. ``episodes`` - 1 greedily; equal arguments give equal episodes.
 
     Neither ``n_arenas`` nor the policy changes which episodes and crashes are drawn, so methods
-    evaluated with one seed are paired.
+    evaluated with one seed are paired. ``effects``: keep Evaluation.effects.
 
     Raises:
         CheckpointError: the policy does not fit the scenario.
         ConfigError: unknown or wrong scenario, or a scripted policy that does not play it.
-        UserError: ``episodes`` or the condition cannot be used with this scenario.
+        UserError: ``episodes`` or the condition cannot be used with this scenario or policy.
     """
     if episodes < 1:
         raise UserError(f"episodes = {episodes}: at least 1 is needed")
     env = make_env(scenario, max(1, min(n_arenas, episodes)))
-    run = _Run(env, _team(target, env), condition, seed)
+    run = _Run(env, _team(target, env), condition, seed, [] if effects else None)
     return run.evaluation(range(episodes))
 
 
@@ -145,7 +169,7 @@ def evaluate_in(
 def record(
     target: PolicyBundle | RecurrentPolicy | Scripted,
     scenario: str | Path,
-    condition: Condition,
+    condition: Condition | Planned,
     episodes: range,
     seed: int,
     n_arenas: int = 32,
@@ -160,7 +184,7 @@ def record(
     def recorder(arena: int, episode: int) -> Recorder:
         return Recorder(env, arena, seed, episode)
 
-    run = _Run(env, _team(target, env), condition, seed, recorder)
+    run = _Run(env, _team(target, env), condition, seed, recorder=recorder)
     run.evaluation(episodes)
     return sorted(run.frames, key=lambda frames: frames.episode)
 
@@ -181,21 +205,20 @@ class _Run:
         self,
         env: BatchEnv,
         team: Team,
-        condition: Condition,
+        condition: Condition | Planned,
         seed: int,
+        effects: list[EffectRow] | None = None,
         recorder: Callable[[int, int], Recorder] | None = None,
     ) -> None:
-        try:
-            coach = Coach(condition.crash, env.spec.robots, seed)
-        except ValueError as error:
-            raise UserError(f"condition {condition.name!r}: {error}") from error
         self._env = env
         self._team = team
         self._condition = condition
         self._seed = seed
-        self._arenas = Arenas(env, team, coach.plan, seed)
+        self._effects = effects
+        planner = _planner(condition, team, env.spec, seed)
+        self._arenas = Arenas(env, team, planner.plan, seed, effects)
         self._hashes: dict[int, TrajectoryHash] = {}
-        self._returns = np.zeros(env.n_arenas, dtype=np.float64)
+        self._faulted = np.zeros((env.n_arenas, env.spec.n_robots), dtype=np.bool_)
         self._recorder = recorder
         self._recorders: dict[int, Recorder] = {}  # by arena, where a recorder was given
         self.frames: list[Frames] = []  # of the episodes that have ended
@@ -207,21 +230,23 @@ class _Run:
         results: list[EpisodeResult] = []
         while waiting or self._arenas.running.any():
             self._start(free[: len(waiting)], waiting)
-            intent = self._team.act(self._env.obs, self._env.available, self._arenas.last_action)
+            seen = self._arenas.sense()
+            intent = self._team.act(seen, self._env.available, self._arenas.last_action)
             self._observe()
-            done = self._arenas.execute(intent)
+            done = self._arenas.execute(intent, self._arenas.worst())
             self._account(done)
             free = self._arenas.count_step(done.result)
             results += [self._result(int(arena), done) for arena in free]
         results.sort(key=lambda result: result.episode)
-        return Evaluation(self._condition.name, self._env.spec.robots, self._seed, tuple(results))
+        name, robots, effects = self._condition.name, self._env.spec.robots, self._effects or ()
+        return Evaluation(name, robots, self._seed, tuple(results), tuple(sorted(effects)))
 
     def _start(self, arenas: ArenaArray, waiting: list[int]) -> None:
         """Takes as many episodes off ``waiting`` as there are arenas for them."""
         episodes = waiting[: len(arenas)]
         del waiting[: len(arenas)]
         self._arenas.start(arenas, np.array(episodes, dtype=np.int64))
-        self._returns[arenas] = 0.0
+        self._faulted[arenas] = False
         for arena, episode in zip(arenas.tolist(), episodes, strict=True):
             self._hashes[arena] = TrajectoryHash(self._seed, episode)
             if self._recorder is not None:
@@ -234,9 +259,9 @@ class _Run:
 
     def _account(self, done: Executed) -> None:
         result = done.result
+        self._faulted |= done.modes != 0
         for arena in np.flatnonzero(self._arenas.running).tolist():
             reward = float(result.reward[arena])
-            self._returns[arena] += reward
             self._hashes[arena].act(
                 done.actions[arena],
                 reward,
@@ -255,12 +280,20 @@ class _Run:
         return EpisodeResult(
             episode=int(self._arenas.episodes[arena]),
             success=success,
-            episode_return=float(self._returns[arena]),
+            episode_return=float(self._arenas.returns[arena]),
             steps=int(self._arenas.steps[arena]),
-            crashed=_faulted(self._arenas.plans[arena]),
+            crashed=tuple(np.flatnonzero(self._faulted[arena]).tolist()),
             trajectory_hash=trajectory_hash,
         )
 
 
-def _faulted(plan: CrashPlan | None) -> tuple[int, ...]:
-    return () if plan is None else tuple(sorted({fault.robot for fault in plan.faults}))
+def _planner(condition: Condition | Planned, team: Team, spec: EnvSpec, seed: int) -> Planner:
+    try:
+        if isinstance(condition, Planned):
+            return condition.planner(TeamSpec.of(spec), seed)
+        coach = Coach(condition.crash, TeamSpec.of(spec), seed)
+    except ValueError as error:
+        raise UserError(f"condition {condition.name!r}: {error}") from error
+    if reason := unmet_needs(condition.crash.crash_mode, offers(team)):
+        raise UserError(f"condition {condition.name!r}: {reason}")
+    return coach
