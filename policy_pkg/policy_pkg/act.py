@@ -21,6 +21,14 @@ def least_valued(q: FloatArray, available: BoolArray) -> IntArray:
     return worst
 
 
+def worst(q: FloatArray, available: BoolArray) -> IntArray:
+    """(..., A) values and availability -> (...) the least valued available action, the first of
+    equals: what an adversarial fault executes."""
+    masked = np.where(available, q, np.float32(np.inf))
+    least: IntArray = masked.argmin(axis=-1).astype(np.int32)
+    return least
+
+
 def epsilon_greedy(
     q: FloatArray, available: BoolArray, epsilon: float, rng: np.random.Generator
 ) -> IntArray:

@@ -51,6 +51,7 @@ class Answer(Generic[Stamp]):
     episode: int
     step: int
     action: int
+    worst_action: int  # available action that the policy values least
     stamp: Stamp
 
 
@@ -71,6 +72,7 @@ class Agent(Generic[Stamp]):
         obs_size: int,
         n_actions: int,
         greedy: Callable[[FloatArray, BoolArray], IntArray],
+        worst: Callable[[FloatArray, BoolArray], IntArray],
     ) -> None:
         """Raises UserError for a robot that is not of the team."""
         for name in robots:
@@ -83,6 +85,7 @@ class Agent(Generic[Stamp]):
         """Observations whose predecessor was never seen: the recurrent state misses a step."""
         self._policy = policy
         self._greedy = greedy
+        self._worst = worst
         n = len(self.robots)
         self._index = np.array([list(team).index(name) for name in self.robots], dtype=np.int32)
         self._obs = np.zeros((n, obs_size), dtype=np.float32)
@@ -155,13 +158,13 @@ class Agent(Generic[Stamp]):
         if len(waiting) == len(self.robots):
             actions = self._act(slice(None))
             order = range(len(self.robots))
-            return [self._remember(i, waiting[i], actions[i]) for i in order]
+            return [self._remember(i, waiting[i], *actions[i]) for i in order]
         rows = sorted(waiting)
         actions = self._act(np.array(rows))
-        return [self._remember(i, waiting[i], a) for i, a in zip(rows, actions, strict=True)]
+        return [self._remember(i, waiting[i], *a) for i, a in zip(rows, actions, strict=True)]
 
-    def _act(self, rows: slice | npt.NDArray[np.intp]) -> list[int]:
-        """Advances the recurrent state of ``rows`` and returns their actions."""
+    def _act(self, rows: slice | npt.NDArray[np.intp]) -> list[tuple[int, int]]:
+        """Advances the recurrent state of ``rows``; returns their best and worst actions."""
         q, hidden = self._policy.forward(
             self._obs[rows], self._last_action[rows], self._index[rows], self._hidden[rows]
         )
@@ -171,8 +174,8 @@ class Agent(Generic[Stamp]):
             index = int(np.arange(len(self.robots))[rows][np.argmin(usable)])
             self._refuse(index)
         self._hidden[rows] = hidden
-        actions: list[int] = self._greedy(q, available).tolist()
-        return actions
+        best, worst = self._greedy(q, available).tolist(), self._worst(q, available).tolist()
+        return list(zip(best, worst, strict=True))
 
     def _refuse(self, robot: int) -> None:
         name = self.robots[robot]
@@ -183,7 +186,9 @@ class Agent(Generic[Stamp]):
             f"{self._obs[robot].tolist()}"
         )
 
-    def _remember(self, robot: int, sensed: Sensed[Stamp], action: int) -> Answer[Stamp]:
-        answer = Answer(robot, sensed.episode, sensed.step, action, sensed.stamp)
+    def _remember(
+        self, robot: int, sensed: Sensed[Stamp], action: int, worst: int
+    ) -> Answer[Stamp]:
+        answer = Answer(robot, sensed.episode, sensed.step, action, worst, sensed.stamp)
         self._answers[robot] = answer
         return answer

@@ -15,7 +15,7 @@ class Health(Enum):
     """Why a robot did what it did in the last step."""
 
     OK = "ok"
-    FAULTED = "command replaced by a fault"
+    FAULTED = "command under a fault of the plan"
     MUTED = "muted by plan"
     LOST = "lost: no command in time"
 
@@ -30,6 +30,8 @@ class Decisions:
         actions: (n,) int32; a muted robot's is its stay action.
         crashed: (n,) uint8; 1 where a fault made the action, or muted the robot.
         health: of each robot, by its newest decision.
+        late: commands of each robot for a step that is over (or not open).
+        duplicates: commands of each robot for the open step beyond the one that counts.
     """
 
     def __init__(self, robots: tuple[str, ...]) -> None:
@@ -43,6 +45,8 @@ class Decisions:
         self.actions: IntArray = np.zeros(n, dtype=np.int32)
         self.crashed = np.zeros(n, dtype=np.uint8)
         self.health = [Health.OK] * n
+        self.late = [0] * n
+        self.duplicates = [0] * n
 
     def open(self, episode: int, step: int, stay: IntArray, available: BoolArray) -> None:
         """Awaits decisions for a new step. stay: (n,); available: (n, A)."""
@@ -76,7 +80,11 @@ class Decisions:
         Raises:
             ValueError: the action is not available to the robot.
         """
-        if episode != self._episode or step != self._step or self._decided[robot]:
+        if episode != self._episode or step != self._step:
+            self.late[robot] += 1
+            return False
+        if self._decided[robot]:
+            self.duplicates[robot] += 1
             return False
         allowed = self._available[robot]
         if not (0 <= action < len(allowed) and allowed[action]):

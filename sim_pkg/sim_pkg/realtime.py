@@ -8,6 +8,7 @@ from sim_pkg.contract import BoolArray, IntArray
 from sim_pkg.lockstep import Health, unavailable
 
 _NEVER_S = float("-inf")
+_NO_STEP = -1
 
 
 class NewestCommands:
@@ -15,6 +16,8 @@ class NewestCommands:
 
     Attributes:
         actions: (n,) int32, crashed: (n,) uint8, health: of each robot, after ``sample``.
+        late: commands of each robot that answer an observation before the newest one.
+        duplicates: commands of each robot for a step that it had answered before.
     """
 
     def __init__(self, robots: tuple[str, ...], cmd_timeout_s: float) -> None:
@@ -22,6 +25,8 @@ class NewestCommands:
         self._robots = robots
         self._timeout_s = cmd_timeout_s
         self._episode = -1
+        self._step = 0
+        self._answered = [_NO_STEP] * n
         self._action = [0] * n
         self._fault = [0] * n
         self._command_s = [_NEVER_S] * n
@@ -29,17 +34,31 @@ class NewestCommands:
         self.actions: IntArray = np.zeros(n, dtype=np.int32)
         self.crashed = np.zeros(n, dtype=np.uint8)
         self.health = [Health.OK] * n
+        self.late = [0] * n
+        self.duplicates = [0] * n
 
     def open(self, episode: int) -> None:
         """A new episode: what was sent for the last one does not count in it."""
         n = len(self._robots)
-        self._episode = episode
+        self._episode, self._step = episode, 0
+        self._answered = [_NO_STEP] * n
         self._command_s = [_NEVER_S] * n
         self._mute_s = [_NEVER_S] * n
 
-    def command(self, robot: int, episode: int, action: int, fault: int, now_s: float) -> None:
+    def observed(self, step: int) -> None:
+        """The observations of ``step`` go out: what answers an older one from now on is late."""
+        self._step = step
+
+    def command(
+        self, robot: int, episode: int, step: int, action: int, fault: int, now_s: float
+    ) -> None:
         """A command; one of another episode is ignored."""
+        if episode != self._episode or step < self._step:
+            self.late[robot] += 1
+        elif step == self._answered[robot]:
+            self.duplicates[robot] += 1
         if episode == self._episode:
+            self._answered[robot] = step
             self._action[robot] = action
             self._fault[robot] = fault
             self._command_s[robot] = now_s

@@ -83,10 +83,10 @@ def test_resends_are_counted_and_end_loudly() -> None:
 def test_real_time_tells_the_newest_the_muted_and_the_lost() -> None:
     newest = NewestCommands(ROBOTS, cmd_timeout_s=3.0)
     newest.open(1)
-    newest.command(0, 1, action=2, fault=0, now_s=10.0)
-    newest.command(1, 1, action=3, fault=2, now_s=10.0)
+    newest.command(0, 1, 0, action=2, fault=0, now_s=10.0)
+    newest.command(1, 1, 0, action=3, fault=2, now_s=10.0)
     newest.mute(2, 1, now_s=10.0)
-    newest.command(2, 0, action=1, fault=0, now_s=11.0)  # of another episode
+    newest.command(2, 0, 0, action=1, fault=0, now_s=11.0)  # of another episode
     assert newest.sample(STAY, ALL, now_s=12.9) == []
     assert newest.health == [Health.OK, Health.FAULTED, Health.MUTED]
     assert newest.actions.tolist() == [2, 3, 4]
@@ -100,11 +100,11 @@ def test_real_time_tells_the_newest_the_muted_and_the_lost() -> None:
 def test_real_time_follows_the_newer_of_command_and_mute() -> None:
     newest = NewestCommands(ROBOTS, cmd_timeout_s=3.0)
     newest.open(0)
-    newest.command(0, 0, 2, 0, now_s=1.0)
+    newest.command(0, 0, 0, 2, 0, now_s=1.0)
     newest.mute(0, 0, now_s=2.0)
     newest.sample(STAY, ALL, now_s=2.1)
     assert (newest.actions[0], newest.health[0]) == (4, Health.MUTED)
-    newest.command(0, 0, 3, 0, now_s=2.2)
+    newest.command(0, 0, 1, 3, 0, now_s=2.2)
     newest.sample(STAY, ALL, now_s=2.3)
     assert (newest.actions[0], newest.health[0]) == (3, Health.OK)
     newest.open(1)
@@ -115,7 +115,7 @@ def test_real_time_follows_the_newer_of_command_and_mute() -> None:
 def test_real_time_refuses_an_unavailable_command() -> None:
     newest = NewestCommands(ROBOTS, cmd_timeout_s=3.0)
     newest.open(0)
-    newest.command(1, 0, 9, 0, now_s=1.0)
+    newest.command(1, 0, 0, 9, 0, now_s=1.0)
     assert "robot_2 sent action 9" in newest.sample(STAY, ALL, now_s=1.1)[0]
     assert newest.actions[1] == 4
     assert newest.health[1] is Health.LOST
@@ -148,3 +148,23 @@ def test_a_session_counts_and_hashes() -> None:
     assert session.crashed.tolist() == [0, 0]
     with pytest.raises(RuntimeError, match="episode 7 is still running"):
         session.begin()
+
+
+def test_late_and_duplicate_commands_are_counted() -> None:
+    decisions = opened()
+    decisions.command(0, 2, 6, 1, 0)
+    for _ in range(3):
+        decisions.command(0, 2, 7, 1, 0)
+    assert (decisions.late, decisions.duplicates) == ([1, 0, 0], [2, 0, 0])
+
+    newest = NewestCommands(ROBOTS, cmd_timeout_s=3.0)
+    newest.open(1)
+    newest.command(0, 1, 0, 2, 0, now_s=1.0)
+    newest.command(0, 1, 0, 2, 0, now_s=1.1)
+    newest.observed(1)
+    newest.command(0, 1, 1, 2, 0, now_s=1.2)
+    newest.command(1, 1, 0, 3, 0, now_s=1.2)  # late, and the newest all the same
+    newest.command(2, 0, 9, 3, 0, now_s=1.2)
+    assert (newest.late, newest.duplicates) == ([0, 1, 1], [1, 0, 0])
+    newest.sample(np.zeros(3, np.int32), np.ones((3, 5), np.bool_), now_s=1.3)
+    assert newest.actions.tolist() == [2, 3, 0]

@@ -21,7 +21,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
-from policy_pkg.act import greedy
+from policy_pkg.act import greedy, worst
 from policy_pkg.agent import Agent
 from policy_pkg.checkpoint import CheckpointError, load_policy
 from policy_pkg.ros.convert import bytes_from_answer, sensed_from_bytes
@@ -33,7 +33,7 @@ RCLError: type[Exception] = rclpy_implementation.RCLError  # bad --ros-args, for
 
 
 class AgentNode(Node):
-    """Subscribes /<robot>/observation and publishes /<robot>/<command_topic> for its robots.
+    """Acts on /<robot>/<observation_topic>, answers on /<robot>/<command_topic>.
 
     Raises:
         UserError: a parameter is missing, unknown or wrong (CheckpointError for the checkpoint).
@@ -44,6 +44,11 @@ class AgentNode(Node):
         robot = self._text("robot", "robot that this policy drives") if one_robot else None
         checkpoint = self._text("checkpoint", "run directory or checkpoint directory")
         command_topic = self._text("command_topic", "answers go to /<robot>/<this>", "command_raw")
+        observation_topic = self._text(
+            "observation_topic",
+            "acts on /<robot>/<this>; observation_seen where the gate relays observations",
+            "observation",
+        )
         self._check_parameters()
         self.failure: UserError | None = None
         """Why the node has to end; an exception in a callback would be told with a traceback."""
@@ -55,6 +60,7 @@ class AgentNode(Node):
             bundle.obs_size,
             bundle.n_actions,
             greedy,
+            worst,
         )
         self._commands = [
             self.create_publisher(Action, f"/{name}/{command_topic}", NEWEST)
@@ -63,7 +69,7 @@ class AgentNode(Node):
         for index, name in enumerate(self.agent.robots):
             self.create_subscription(
                 Observation,
-                f"/{name}/observation",
+                f"/{name}/{observation_topic}",
                 partial(self._on_observation, index),
                 NEWEST,
                 raw=True,

@@ -21,7 +21,7 @@ _FRAME_ID_LENGTH = struct.Struct("<I")
 _FRAME_ID_AT = 16
 _OBSERVED = struct.Struct("<IIiI")  # episode, step, last_action, number of features
 _COUNT = struct.Struct("<I")
-_COMMANDED = struct.Struct("<IIiB")  # episode, step, action, fault
+_COMMANDED = struct.Struct("<IIiiB")  # episode, step, action, worst_action, fault
 
 
 def sensed_from_bytes(data: bytes) -> Sensed[bytes]:
@@ -48,4 +48,6 @@ def sensed_from_bytes(data: bytes) -> Sensed[bytes]:
 
 def bytes_from_answer(answer: Answer[bytes]) -> bytes:
     """A crash_coach_interfaces/Action with the header of the observation that it answers."""
-    return answer.stamp + _COMMANDED.pack(answer.episode, answer.step, answer.action, 0)
+    return answer.stamp + _COMMANDED.pack(
+        answer.episode, answer.step, answer.action, answer.worst_action, 0
+    )

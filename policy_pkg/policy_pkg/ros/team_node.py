@@ -8,7 +8,7 @@ from policy_pkg.ros.agent_node import AgentNode, spin
 
 
 class TeamNode(AgentNode):
-    """Parameters: checkpoint, command_topic; the robots come from the checkpoint."""
+    """Parameters: checkpoint, command_topic, observation_topic; the checkpoint names the robots."""
 
     def __init__(self) -> None:
         super().__init__("team", one_robot=False)

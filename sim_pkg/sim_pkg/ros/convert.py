@@ -26,7 +26,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from sim_pkg.contract import EnvSpec, UserError
 from sim_pkg.frames import Side, actors, vitals
-from sim_pkg.lockstep import Health
+from sim_pkg.lockstep import Decisions, Health
+from sim_pkg.realtime import NewestCommands
 from sim_pkg.scenarios.base import Scene
 from sim_pkg.session import Session
 
@@ -37,7 +38,7 @@ _HEAD = struct.Struct("<4siII")
 _COUNT = struct.Struct("<I")
 _FRAME_ID_AT = 16
 _OBSERVED = struct.Struct("<IIi")  # episode, step, last_action
-_COMMANDED = struct.Struct("<IIiB")  # episode, step, action, fault
+_COMMANDED = struct.Struct("<IIiiB")  # episode, step, action, worst_action, fault
 _NS_PER_S = 1_000_000_000
 _RED = ColorRGBA(r=0.85, g=0.15, b=0.15, a=1.0)
 _BLUE = ColorRGBA(r=0.2, g=0.4, b=0.85, a=1.0)
@@ -69,7 +70,7 @@ def set_time(stamp: Time, nanoseconds: int) -> None:
 
 def is_mute(event: FaultEvent) -> bool:
     """Whether the gate says that it withheld a robot's command."""
-    return bool(event.kind == FaultEvent.EFFECT and event.applied < 0)
+    return bool(event.kind == FaultEvent.EFFECT and event.applied == FaultEvent.WITHHELD)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,9 +93,11 @@ def command_from_bytes(data: bytes) -> Commanded:
         raise UserError(f"command: encapsulation {data[:2].hex()} is not little-endian CDR")
     try:
         (length,) = _COUNT.unpack_from(data, _FRAME_ID_AT - _COUNT.size)
-        return Commanded(*_COMMANDED.unpack_from(data, _FRAME_ID_AT + (length + 3 & ~3)))
+        start = _FRAME_ID_AT + (length + 3 & ~3)
+        episode, step, action, _, fault = _COMMANDED.unpack_from(data, start)
     except struct.error as error:
         raise UserError(f"command of {len(data)} bytes is cut short: {error}") from error
+    return Commanded(episode, step, action, fault)
 
 
 class ObservationWriter:
@@ -239,18 +242,28 @@ def _outline(header: Header, scene: Scene) -> Marker:
     return marker
 
 
-def diagnostics(robots: tuple[str, ...], health: list[Health], stamp: Time) -> DiagnosticArray:
+def diagnostics(
+    decided: Decisions | NewestCommands, session: Session, stamp: Time
+) -> DiagnosticArray:
     """One status per robot: OK, WARN where a plan faults it, ERROR where it is lost."""
     message = DiagnosticArray()
     message.header.stamp = stamp
-    for robot, state in zip(robots, health, strict=True):
+    for i, robot in enumerate(session.env.spec.robots):
+        state = decided.health[i]
+        values = {
+            "state": state.name.lower(),
+            "episode": session.episode,
+            "step": session.step,
+            "late": decided.late[i],
+            "duplicates": decided.duplicates[i],
+        }
         message.status.append(
             DiagnosticStatus(
                 level=_LEVELS[state],
                 name=f"sim: {robot}",
                 message=state.value,
                 hardware_id=robot,
-                values=[KeyValue(key="state", value=state.name.lower())],
+                values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
             )
         )
     return message

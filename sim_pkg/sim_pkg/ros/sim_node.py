@@ -118,6 +118,8 @@ class SimNode(Node):
         session = self._session
         if self._lockstep:
             self._decisions.open(session.episode, session.step, session.stay(), session.available)
+        else:
+            self._newest.observed(session.step)
         self._sent_s = time.monotonic()
         self._topics.publish_step(session)
 
@@ -131,7 +133,12 @@ class SimNode(Node):
             return
         if not self._lockstep:
             self._newest.command(
-                robot, message.episode, message.action, message.fault, time.monotonic()
+                robot,
+                message.episode,
+                message.step,
+                message.action,
+                message.fault,
+                time.monotonic(),
             )
             return
         try:
@@ -217,7 +224,7 @@ class SimNode(Node):
     def _housekeeping(self) -> None:
         self._topics.refresh_listeners()
         decided = self._decisions if self._lockstep else self._newest
-        self._topics.publish_diagnostics(decided.health)
+        self._topics.publish_diagnostics(decided, self._session)
 
     # --- services ---------------------------------------------------------------------------
 

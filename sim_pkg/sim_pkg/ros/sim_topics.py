@@ -16,7 +16,8 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from sim_pkg.contract import EnvSpec
-from sim_pkg.lockstep import Health
+from sim_pkg.lockstep import Decisions
+from sim_pkg.realtime import NewestCommands
 from sim_pkg.ros import convert
 from sim_pkg.session import Session
 
@@ -119,10 +120,10 @@ class SimTopics:
         for robot in robots:
             self._obs_pubs[robot].publish(self._observations.messages[robot])
 
-    def publish_diagnostics(self, health: list[Health]) -> None:
+    def publish_diagnostics(self, decided: Decisions | NewestCommands, session: Session) -> None:
         """Stamped with wall time: it is about processes, not about the simulated world."""
         stamp = self._node.get_clock().now().to_msg()
-        self._diagnostics_pub.publish(convert.diagnostics(self._spec.robots, health, stamp))
+        self._diagnostics_pub.publish(convert.diagnostics(decided, session, stamp))
 
     def flush(self) -> None:
         """Waits, within bounds, until every reader has the last episode state."""
