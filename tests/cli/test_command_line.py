@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from crash_coach_bringup.cli.evaluate import CrashMode, conditions
+from crash_coach_bringup.cli.crash_options import conditions, mode_parameters
 from crash_coach_bringup.cli.main import repeat_options
 from crash_coach_bringup.cli.output import CliError, check_json_target, write_json
 from crash_coach_bringup.cli.train import plan_jobs
@@ -57,15 +57,16 @@ def test_negative_values_are_values() -> None:
 
 
 def test_conditions_in_order() -> None:
-    found = conditions(ROBOTS, [0.05], [0, 1], ["robot_2"], CrashMode.random)
+    found = conditions(ROBOTS, [0.05], [0, 1], ["robot_2"], "delay", {"steps": 2.0})
     assert [c.crash.crash_rate for c in found] == [0.05, 0.0, 0.0, 0.0]
     assert [c.crash.crashed_exactly for c in found] == [-1, 0, 1, -1]
     assert found[3].crash.victims == ("robot_2",)
-    assert {c.crash.crash_mode for c in found} == {"random"}
+    assert {c.crash.crash_mode for c in found} == {"delay"}
+    assert [c.crash.crash_parameters for c in found] == [{"steps": 2.0}] * 4
 
 
 def test_without_a_crash_option_it_is_crash_free() -> None:
-    (found,) = conditions(ROBOTS, [], [], [], CrashMode.stay)
+    (found,) = conditions(ROBOTS, [], [], [], "stay", {})
     assert found.crash.strategy == "none"
 
 
@@ -83,7 +84,35 @@ def test_wrong_conditions_are_named(
     rates: list[float], crashed: list[int], victims: list[str], names: str
 ) -> None:
     with pytest.raises(CliError, match=names):
-        conditions(ROBOTS, rates, crashed, victims, CrashMode.stay)
+        conditions(ROBOTS, rates, crashed, victims, "stay", {})
+
+
+@pytest.mark.parametrize(
+    ("mode", "given", "message"),
+    [
+        ("explode", [], "--mode explode: unknown crash mode .*mute, random"),
+        ("delay", ["steps"], "--param steps: NAME=VALUE"),
+        ("delay", ["=3"], "--param =3: NAME=VALUE"),
+        ("delay", ["steps=much"], "--param steps=much: 'much' is not a number"),
+        ("delay", ["steps=2", "steps=3"], "--param steps=3: steps is given more than once"),
+        ("delay", ["stps=3"], "--param: .*stps.*its parameters: steps"),
+        ("delay", ["steps=0"], "--param: .*steps = 0.0: .*greater than or equal to 1"),
+        ("delay", ["steps=2.5"], "--param: .*steps = 2.5: .*integer"),
+        ("noise", ["stddev=nan"], "--param: .*stddev = nan: .*finite"),
+        ("mute", ["steps=3"], "--param: .*its parameters: none"),
+    ],
+)
+def test_wrong_modes_and_parameters_are_named(mode: str, given: list[str], message: str) -> None:
+    with pytest.raises(CliError, match=message):
+        mode_parameters(mode, given)
+
+
+def test_parameters_of_a_mode() -> None:
+    assert mode_parameters("drop", ["to_bad=.1", "probability=1"]) == {
+        "to_bad": 0.1,
+        "probability": 1.0,
+    }
+    assert mode_parameters("stay", []) == {}
 
 
 def test_several_runs_get_folders_of_their_own(tmp_path: Path) -> None:

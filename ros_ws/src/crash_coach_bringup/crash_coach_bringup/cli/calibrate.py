@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from crash_coach_bringup.cli.evaluate import (
-    MOST_EPISODES,
+from crash_coach_bringup.cli.crash_options import (
     CrashedOption,
-    CrashMode,
     ModeOption,
+    ParamOption,
     conditions,
+    mode_parameters,
 )
+from crash_coach_bringup.cli.evaluate import MOST_EPISODES
 from crash_coach_bringup.cli.output import (
     CliError,
     check_json_target,
@@ -50,7 +51,11 @@ def figures(episodes: Sequence[Frames]) -> dict[str, Any]:
 
 
 def asked_of(
-    scenario: str, policies: list[str], crashed: list[int], mode: CrashMode
+    scenario: str,
+    policies: list[str],
+    crashed: list[int],
+    mode: str,
+    parameters: Mapping[str, float],
 ) -> list[tuple[str, Condition]]:
     """Every policy under every condition.
 
@@ -62,7 +67,7 @@ def asked_of(
     names = policies or list(scripted_names(env))
     for name in names:
         make_scripted(name, env)
-    under = conditions(env.spec.robots, [], crashed, [], mode)
+    under = conditions(env.spec.robots, [], crashed, [], mode, parameters)
     return [(name, condition) for name in names for condition in under]
 
 
@@ -103,7 +108,8 @@ def calibrate(
         list[str] | None, typer.Option(help="NAME ...: these; default: all that play it.")
     ] = None,
     crashed: CrashedOption = None,
-    mode: ModeOption = CrashMode.stay,
+    mode: ModeOption = "stay",
+    param: ParamOption = None,
     episodes: Annotated[
         int, typer.Option(help="Episodes of each.", min=1, max=MOST_EPISODES)
     ] = 256,
@@ -115,10 +121,14 @@ def calibrate(
     if not scenarios:
         raise CliError("no scenario: name at least one, such as skirmish/3s_vs_5z")
     # What is wrong is said before anything is played.
-    asked = {name: asked_of(name, policy or [], crashed or [], mode) for name in scenarios}
+    parameters = mode_parameters(mode, param or [])
+    asked = {
+        name: asked_of(name, policy or [], crashed or [], mode, parameters) for name in scenarios
+    }
     rows: list[dict[str, Any]] = []
     for scenario, played in asked.items():
         here = rows_of(scenario, played, episodes, seed)
         show(f"{scenario}: {episodes} episodes each, seed {seed}", here)
         rows += here
-    write_json(json, {"seed": seed, "episodes": episodes, "mode": mode.value, "rows": rows})
+    how = {"mode": mode, "parameters": parameters}
+    write_json(json, {"seed": seed, "episodes": episodes, **how, "rows": rows})

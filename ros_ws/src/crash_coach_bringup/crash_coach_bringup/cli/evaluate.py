@@ -10,6 +10,13 @@ from typing import Annotated, Any
 
 import typer
 
+from crash_coach_bringup.cli.crash_options import (
+    CrashedOption,
+    ModeOption,
+    ParamOption,
+    conditions,
+    mode_parameters,
+)
 from crash_coach_bringup.cli.output import (
     CliError,
     check_json_target,
@@ -19,31 +26,11 @@ from crash_coach_bringup.cli.output import (
     write_json,
 )
 from crash_coach_bringup.cli.target import HELP, Target, load_target
-from policy_pkg.train.evaluate import (
-    Condition,
-    Evaluation,
-    Scripted,
-    at_rate,
-    crash_free,
-    exactly,
-    named,
-)
+from policy_pkg.train.evaluate import Condition, Evaluation, Scripted
 from policy_pkg.train.evaluate import evaluate as evaluate_in_core
 from sim_pkg.trajectory import combine
 
 MOST_EPISODES = 1_000_000
-
-
-class CrashMode(StrEnum):
-    stay = "stay"
-    mute = "mute"
-    random = "random"
-
-
-CrashedOption = Annotated[
-    list[int] | None, typer.Option(help="K ...: exactly K robots, drawn anew each episode.")
-]
-ModeOption = Annotated[CrashMode, typer.Option(help="What a crashed robot does.")]
 
 
 class Via(StrEnum):
@@ -55,34 +42,6 @@ class Layout(StrEnum):
     nodes = "nodes"
     team = "team"
     single = "single"
-
-
-def conditions(
-    robots: tuple[str, ...],
-    rates: list[float],
-    crashed: list[int],
-    victims: list[str],
-    mode: CrashMode,
-) -> list[Condition]:
-    """What to evaluate under, in the order rates, counts, victims; crash-free without any.
-
-    Raises:
-        CliError: names the option, its value and what would be right.
-    """
-    for rate in rates:
-        if not 0 <= rate <= 1:
-            raise CliError(f"--crash-rate {rate}: a probability from 0 to 1 is needed")
-    for count in crashed:
-        if not 0 <= count <= len(robots):
-            raise CliError(f"--crashed {count}: the team has {len(robots)} robots")
-    for name in victims:
-        if name not in robots:
-            raise CliError(f"--victims {name}: unknown robot; one of: {', '.join(robots)}")
-    out = [at_rate(rate, mode.value) for rate in rates]
-    out += [exactly(count, mode.value) for count in crashed]
-    if victims:
-        out.append(named(list(dict.fromkeys(victims)), mode.value))
-    return out or [crash_free()]
 
 
 def evaluator(
@@ -148,7 +107,8 @@ def evaluate(
     victims: Annotated[
         list[str] | None, typer.Option(help="ROBOT ...: these robots, in every episode.")
     ] = None,
-    mode: ModeOption = CrashMode.stay,
+    mode: ModeOption = "stay",
+    param: ParamOption = None,
     via: Annotated[
         Via, typer.Option(help="In this process, or as a real ROS graph in lock-step.")
     ] = Via.core,
@@ -163,9 +123,12 @@ def evaluate(
 ) -> None:
     """Evaluates a team, a trained one greedily; without a crash option, crash-free."""
     check_json_target(json)
+    parameters = mode_parameters(mode, param or [])
     target = load_target(team, scenario)
     name = target.scenario
-    asked = conditions(target.robots, crash_rate or [], crashed or [], victims or [], mode)
+    asked = conditions(
+        target.robots, crash_rate or [], crashed or [], victims or [], mode, parameters
+    )
     run = evaluator(target, via, layout)
     results = [(condition, run(condition, episodes, seed)) for condition in asked]
     show(f"{team} on {name}: {episodes} episodes each, seed {seed}, via {via}", results)
@@ -174,5 +137,5 @@ def evaluate(
     console.print(f"trajectory hash {trajectory_hash}", soft_wrap=True)
     result: dict[str, Any] = {"team": team, "scenario": name, "via": via.value}
     result["layout"] = layout.value if via is Via.ros else None
-    result |= {"seed": seed, "episodes": episodes, "mode": mode.value}
+    result |= {"seed": seed, "episodes": episodes, "mode": mode, "parameters": parameters}
     write_json(json, {**result, "trajectory_hash": trajectory_hash, "conditions": summaries})

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from crash_coach_bringup.cli.evaluate import CrashMode
+from crash_coach_bringup.cli.crash_options import ModeOption, ParamOption, mode_parameters
 from crash_coach_bringup.cli.output import CliError, check_json_target, console, write_json
 
 
@@ -22,10 +22,17 @@ def inject(
     victims: Annotated[
         list[str] | None, typer.Option(help="ROBOT ...: who crashes, e.g. robot_1.")
     ] = None,
-    mode: Annotated[CrashMode, typer.Option(help="What a crashed robot does.")] = CrashMode.mute,
+    mode: ModeOption = "mute",
+    param: ParamOption = None,
     apply_at: Annotated[
         ApplyAt, typer.Option(help="The very next control step, or the next episode on.")
     ] = ApplyAt.next_step,
+    start: Annotated[
+        int,
+        typer.Option(
+            help="First faulted step of each episode, with --apply-at next_episode.", min=0
+        ),
+    ] = 0,
     duration_steps: Annotated[
         int, typer.Option(help="Control steps; 0: until the episode ends.", min=0)
     ] = 0,
@@ -39,6 +46,9 @@ def inject(
     check_json_target(json)
     if clear == bool(victims):
         raise CliError("give either --victims ROBOT ... or --clear")
+    if start and apply_at is not ApplyAt.next_episode:
+        raise CliError(f"--start {start}: needs --apply-at next_episode; the next step is now")
+    parameters = mode_parameters(mode, param or [])
     from crash_coach_bringup.ros import inject as client
 
     if clear:
@@ -47,7 +57,7 @@ def inject(
         write_json(json, {"cleared": True, "answer": answer})
         return
     result = client.inject(
-        victims or [], mode.value, apply_at.value, duration_steps, timeout_s=timeout_s
+        victims or [], mode, apply_at.value, duration_steps, start, timeout_s, parameters=parameters
     )
     console.print(str(result))
     write_json(json, asdict(result))

@@ -21,7 +21,7 @@ from crash_coach_bringup.cli import (
 from sim_pkg.contract import UserError
 
 # Options that take several values, up to the next option: --crashed 0 1 2
-SEVERAL = {"--crash-rate", "--crashed", "--victims", "--set", "--seed", "--policy"}
+SEVERAL = {"--crash-rate", "--crashed", "--victims", "--set", "--seed", "--policy", "--param"}
 
 app = typer.Typer(
     name="crash-coach",

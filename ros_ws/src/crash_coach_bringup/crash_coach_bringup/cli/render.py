@@ -7,7 +7,12 @@ from typing import Annotated, Any
 
 import typer
 
-from crash_coach_bringup.cli.evaluate import CrashMode, ModeOption, conditions
+from crash_coach_bringup.cli.crash_options import (
+    ModeOption,
+    ParamOption,
+    conditions,
+    mode_parameters,
+)
 from crash_coach_bringup.cli.output import (
     CliError,
     check_file_target,
@@ -81,7 +86,8 @@ def render(
     ] = None,
     crashed: Annotated[int | None, typer.Option(help="So many robots crash, drawn.")] = None,
     victims: Annotated[list[str] | None, typer.Option(help="ROBOT ...: these robots.")] = None,
-    mode: ModeOption = CrashMode.stay,
+    mode: ModeOption = "stay",
+    param: ParamOption = None,
     speed: Annotated[float, typer.Option(help="Of a film, times real time.")] = 1.0,
     json: Annotated[Path | None, typer.Option(help="Also write what happened here.")] = None,
 ) -> None:
@@ -90,10 +96,11 @@ def render(
     check_out(out)
     if not 0.01 <= speed <= 1000:
         raise CliError(f"--speed {speed}: 0.01 to 1000 times real time")
+    parameters = mode_parameters(mode, param or [])
     target = load_target(team, scenario)
     rates = [] if crash_rate is None else [crash_rate]
     counts = [] if crashed is None else [crashed]
-    asked = conditions(target.robots, rates, counts, victims or [], mode)
+    asked = conditions(target.robots, rates, counts, victims or [], mode, parameters)
     if len(asked) > 1:
         raise CliError("--crash-rate, --crashed, --victims: an episode is played under one of them")
     (frames,) = record(target.team, target.scenario, asked[0], range(episode, episode + 1), seed)

@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from std_srvs.srv import Trigger
 
 from crash_coach_bringup.ros.client import GraphClient, graph_client
+from crash_coach_pkg.faults import check_parameters, fault_mode
+from crash_coach_pkg.parameters import NO_RETURN
 from sim_pkg.contract import UserError
 
 COACH = "/coach"
+NOBODY_ELSE = {
+    "strategy": "fixed",
+    "crashed_exactly": -1,
+    "victim_role": "",
+    "hazard_rate_hz": 0.0,
+    "near_radius_m": 0.0,
+    "return_above": NO_RETURN,
+}
+"""Ends every other way in which the coach was told to choose victims."""
 
 
 class InjectError(UserError):
@@ -29,11 +40,12 @@ class InjectResult:
     apply_at: str
     start_step: int
     duration_steps: int
+    parameters: dict[str, float] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        return (
-            f"{', '.join(self.victims)}: {self.mode} from the {self.apply_at.replace('_', ' ')} on"
-        )
+        how = ", ".join(f"{name} {value:g}" for name, value in self.parameters.items())
+        mode = f"{self.mode} ({how})" if how else self.mode
+        return f"{', '.join(self.victims)}: {mode} from the {self.apply_at.replace('_', ' ')} on"
 
 
 def inject(
@@ -44,43 +56,48 @@ def inject(
     start_step: int = 0,
     timeout_s: float = 10.0,
     domain: int | None = None,
+    parameters: Mapping[str, float] | None = None,
 ) -> InjectResult:
     """Makes ``victims`` crash, all or none; returns once the gate has armed the fault.
 
     Args:
         victims: names of robots.
-        mode: mute, stay or random.
+        mode: a mode of crash_coach_pkg.faults.
         apply_at: next_step or next_episode.
         duration_steps: control steps; 0: until the episode ends.
         start_step: first faulted step of each episode, for next_episode.
         timeout_s: longest wait for the coach to appear, and again for its answer.
         domain: ROS domain; None: the environment's.
+        parameters: of the mode; what is missing has its default.
 
     Raises:
         InjectError: no victims, or the coach refused, with its reason.
+        UserError: unknown mode, or parameters that it does not have.
         WaitError: no coach on this domain, or no answer.
     """
     if not victims:
         raise InjectError("name at least one robot to crash")
+    known = check_parameters(mode, parameters or {}).model_dump()
     wanted = {
+        **NOBODY_ELSE,
+        **{f"{fault_mode(mode).name}.{name}": value for name, value in known.items()},
         "enabled": True,
-        "strategy": "fixed",
         "victims": list(victims),
         "crash_mode": mode,
         "apply_at": apply_at,
         "start_step": start_step,
         "duration_steps": duration_steps,
     }
-    parameters = [Parameter(name, value=value) for name, value in wanted.items()]
+    settings = [Parameter(name, value=value) for name, value in wanted.items()]
     with graph_client("crash_coach_inject", domain) as client:
         setter = AsyncParameterClient(client.node, COACH)
         client.greet(COACH, timeout_s, _no_coach(domain))
         client.until(setter.services_are_ready, timeout_s, _no_coach(domain))
-        future = setter.set_parameters_atomically(parameters)
+        future = setter.set_parameters_atomically(settings)
         result = client.result(future, timeout_s, "the coach's answer").result
     if not result.successful:
         raise InjectError(f"the coach refused: {result.reason}")
-    return InjectResult(tuple(victims), mode, apply_at, start_step, duration_steps)
+    return InjectResult(tuple(victims), mode, apply_at, start_step, duration_steps, known)
 
 
 def clear(timeout_s: float = 10.0, domain: int | None = None) -> str:
