@@ -73,8 +73,9 @@ class Relay:
         self._dt_s = dt_s
         self._tools = tools
         self._start_s = now_s
-        self._book = PlanBook(False, 0.0, lambda plan: refusal(plan, offers))
-        self._book.enter(EPISODE)
+        self.book = PlanBook(False, 0.0, lambda plan: refusal(plan, offers))
+        """The plans; read only."""
+        self.book.enter(EPISODE)
         self._step = 0
         self._relayed_in = -1  # the newest step that a command was decided in
         self._last: list[bytes | None] = [None] * n_robots  # passed on
@@ -83,21 +84,6 @@ class Relay:
         self._running: list[Change] = []
         self._decided_in = [-1] * n_robots  # under a fault
         self._waiting: list[bytes | None] = [None] * n_robots  # for the next tick
-
-    @property
-    def ignored_plans(self) -> int:
-        """Plans with an older revision."""
-        return self._book.ignored
-
-    @property
-    def in_force(self) -> CrashPlan:
-        """As PlanBook.in_force."""
-        return self._book.in_force
-
-    @property
-    def lease_s(self) -> float:
-        """Of the newest plan."""
-        return self._book.lease_s
 
     def decided(self) -> list[Decided]:
         """Of each robot, now."""
@@ -123,18 +109,14 @@ class Relay:
     def plan(self, plan: CrashPlan, lease_s: float, now_s: float) -> Outputs:
         """Takes a plan or its heartbeat."""
         outputs = self._advance(now_s)
-        self._book.next_step = self._step + (self._relayed_in == self._step)
-        return [*outputs, *self._book.plan(plan, lease_s, now_s), *self._follow()]
-
-    def refused(self, episode: int, revision: int, reason: str) -> tuple[Event, ...]:
-        """Notes a plan that could not even be read."""
-        return self._book.refused(episode, revision, reason)
+        self.book.next_step = self._step + (self._relayed_in == self._step)
+        return [*outputs, *self.book.plan(plan, lease_s, now_s), *self._follow()]
 
     def tick(self, now_s: float) -> Outputs:
         """Call at least once in every step: ends leases and stretches, passes on what is due."""
         outputs = self._advance(now_s)
-        self._book.next_step = self._step + (self._relayed_in == self._step)
-        return [*outputs, *self._book.tick(now_s), *self._follow()]
+        self.book.next_step = self._step + (self._relayed_in == self._step)
+        return [*outputs, *self.book.tick(now_s), *self._follow()]
 
     def _advance(self, now_s: float) -> Outputs:
         """Goes on to the step of ``now_s``."""
@@ -160,14 +142,14 @@ class Relay:
     def _follow(self) -> Outputs:
         """Enters the step under the term that governs it."""
         outputs: Outputs = []
-        term = self._book.at(self._step)
+        term = self.book.at(self._step)
         if term is not self._term:
             # Where the new term has no faults at all, the whole team was told.
             if term is not None and term.faulted:
                 outputs += [self._changed(EventKind.CLEARED, it, term) for it in self._running]
             self._term, self._team, self._running = term, None, []
             if term is not None:  # what came before will not be asked for again
-                self._book.terms = self._book.terms[self._book.terms.index(term) :]
+                self.book.terms = self.book.terms[self.book.terms.index(term) :]
             if term is not None and term.faulted:
                 self._team = TeamFaults(term.plan, self._n, term.first_step, self._last)
                 self._last = self._team.last

@@ -166,7 +166,7 @@ def test_a_silent_coach_loses_its_lease() -> None:
     stream.tick(LEASE_S / DT_S + 1)
     assert stream.kinds()[-1] == EventKind.EXPIRED
     assert stream.command(0, LEASE_S / DT_S + 1)
-    assert stream.relay.in_force.faults == ()
+    assert stream.relay.book.in_force.faults == ()
 
 
 @pytest.mark.parametrize(

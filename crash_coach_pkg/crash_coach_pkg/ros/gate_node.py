@@ -26,6 +26,7 @@ from crash_coach_pkg.ros.convert import (
     world_from_message,
 )
 from crash_coach_pkg.ros.gate_base import ACTION_TYPE, Gate, GateBase
+from crash_coach_pkg.ros.relay_node import RelayGate
 from crash_coach_pkg.ros.run import EPISODE, NEWEST, spin
 from sim_pkg.contract import UserError
 
@@ -192,9 +193,7 @@ def start(executor: Executor) -> Node:
 
 
 def _attach(base: GateBase) -> Gate:
-    if base.command_type == ACTION_TYPE:
-        return ActionGate(base)
-    raise UserError(f"parameter 'command_type' {base.command_type!r} is not {ACTION_TYPE}")
+    return ActionGate(base) if base.command_type == ACTION_TYPE else RelayGate(base)
 
 
 def main() -> int:

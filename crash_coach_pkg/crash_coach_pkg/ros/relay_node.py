@@ -1,0 +1,191 @@
+"""The gate of robots that this project does not simulate: any topic, any type of command."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from functools import partial
+
+from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.subscription import Subscription
+
+from crash_coach_pkg.health import Decided
+from crash_coach_pkg.plan import CrashPlan
+from crash_coach_pkg.plan_book import PlanBook
+from crash_coach_pkg.relay import Outputs, Relay, Sent
+from crash_coach_pkg.ros.command_types import Limits, command_type
+from crash_coach_pkg.ros.endpoints import Offer, offered
+from crash_coach_pkg.ros.gate_base import GateBase
+from sim_pkg.contract import UserError
+
+_MATCH = "match"
+_RELIABILITY = {
+    "reliable": ReliabilityPolicy.RELIABLE,
+    "best_effort": ReliabilityPolicy.BEST_EFFORT,
+}
+_DURABILITY = {
+    "volatile": DurabilityPolicy.VOLATILE,
+    "transient_local": DurabilityPolicy.TRANSIENT_LOCAL,
+}
+# Of publishers with default settings: what is asked for until one is seen.
+_USUAL = Offer(ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE)
+_LOOK_S = 1.0
+
+
+class RelayGate:
+    """Relays bytes; a serialized command is looked into only where a fault in force asks for it.
+
+    Parameters beside GateBase's: dt_s, limit.linear_x_m_s, limit.linear_y_m_s,
+    limit.angular_z_rad_s, reliability, durability, depth.
+
+    Raises:
+        UserError: a parameter is wrong, or the type of command is not installed.
+    """
+
+    def __init__(self, base: GateBase) -> None:
+        self._base = base
+        self._type = command_type(base.command_type, _limits(base))
+        dt_s = base.number(
+            "dt_s",
+            0.1,
+            (0.001, 60.0),
+            "Length of a step of the faults, seconds: the period of the robots' commands. Under a "
+            "fault a robot gets at most one command per step. The coach's dt_s must be the same.",
+        )
+        self._reliability = _choice(base, "reliability", tuple(_RELIABILITY))
+        self._durability = _choice(base, "durability", tuple(_DURABILITY))
+        self._depth = _depth(base)
+        n = len(base.robots)
+        now_s = time.monotonic()
+        self._relay = Relay(n, dt_s, self._type.offers, self._type.tools, now_s)
+        base.create_timer(dt_s, self._on_step, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._commands = [0] * n
+        self._relayed = [0] * n
+        # Reliable satisfies robots of either kind.
+        offer = Offer(
+            _RELIABILITY.get(self._reliability, _USUAL.reliability),
+            _DURABILITY.get(self._durability, _USUAL.durability),
+        )
+        qos = offer.request(self._depth)
+        self._publish = [
+            base.command_publisher(robot, self._type.message, qos).publish for robot in range(n)
+        ]
+        self._asked: list[Offer] = [offer] * n
+        self._inputs: list[Subscription] = [self._subscribe(robot) for robot in range(n)]
+        self._mismatched = True  # look at once
+        self._looked_s = now_s
+
+    # --- as Gate ----------------------------------------------------------------------------
+
+    @property
+    def book(self) -> PlanBook:
+        return self._relay.book
+
+    def plan(self, plan: CrashPlan, lease_s: float, now_s: float) -> None:
+        self._send(self._relay.plan(plan, lease_s, now_s))
+
+    def tick(self, now_s: float) -> None:
+        if self._mismatched or now_s - self._looked_s >= _LOOK_S:
+            self._mismatched, self._looked_s = False, now_s
+            self._match()
+        self._send(self._relay.tick(now_s))
+
+    def decided(self) -> Sequence[Decided]:
+        return self._relay.decided()
+
+    def counters(self, robot: int) -> Sequence[tuple[str, int]]:
+        return (("commands", self._commands[robot]), ("relayed", self._relayed[robot]))
+
+    def warning(self, robot: int) -> str:
+        if self._inputs[robot].get_publisher_count() > 0:
+            return ""
+        return f"nobody publishes on {self._inputs[robot].topic_name}"
+
+    def close(self) -> None:
+        """Nothing is open that the node does not close."""
+
+    # --- relaying ---------------------------------------------------------------------------
+
+    def _on_command(self, robot: int, data: bytes) -> None:
+        now_s = time.monotonic()
+        self._base.health.heard(robot, now_s)
+        self._commands[robot] += 1
+        self._send(self._relay.command(robot, data, now_s))
+
+    def _on_step(self) -> None:
+        self._send(self._relay.tick(time.monotonic()))
+
+    def _send(self, outputs: Outputs) -> None:
+        for output in outputs:
+            if isinstance(output, Sent):
+                self._publish[output.robot](output.data)
+                self._relayed[output.robot] += 1
+            else:
+                self._base.send_events((output,))
+
+    # --- quality of service -----------------------------------------------------------------
+
+    def _subscribe(self, robot: int) -> Subscription:
+        return self._base.create_subscription(
+            self._type.message,
+            f"/{self._base.robots[robot]}/{self._base.raw_topic}",
+            partial(self._on_command, robot),
+            self._asked[robot].request(self._depth),
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._on_mismatch),
+            raw=True,
+        )
+
+    def _on_mismatch(self, _: object) -> None:
+        """A publisher offers less than is asked for: not from here, where DDS is calling."""
+        self._mismatched = True
+
+    def _match(self) -> None:
+        """Asks each robot's publishers for what all of them offer."""
+        for robot, subscription in enumerate(self._inputs):
+            found = offered(self._base, subscription.topic_name)
+            if found is None:
+                continue
+            wanted = Offer(
+                _RELIABILITY.get(self._reliability, found.reliability),
+                _DURABILITY.get(self._durability, found.durability),
+            )
+            if wanted != self._asked[robot]:
+                self._asked[robot] = wanted
+                self._base.destroy_subscription(subscription)
+                self._inputs[robot] = self._subscribe(robot)
+
+
+def _limits(base: GateBase) -> Limits:
+    about = "Twist types: a random command is uniform within plus and minus this, "
+    return Limits(
+        base.number("limit.linear_x_m_s", 0.5, (0.0, 100.0), f"{about}m/s."),
+        base.number("limit.linear_y_m_s", 0.0, (0.0, 100.0), f"{about}m/s."),
+        base.number("limit.angular_z_rad_s", 1.0, (0.0, 100.0), f"{about}rad/s."),
+    )
+
+
+def _choice(base: GateBase, name: str, values: tuple[str, ...]) -> str:
+    """A parameter of QoS; raises UserError naming the choices."""
+    known = ", ".join((_MATCH, *values))
+    value = base.text(
+        name,
+        _MATCH,
+        f"Of the robots' command topics: {known}. match: what all publishers of the raw topic "
+        "offer is asked for, and the usual (reliable, volatile) is offered to the robots.",
+    )
+    if value not in (_MATCH, *values):
+        raise UserError(f"parameter {name} = {value!r}; one of: {known}")
+    return value
+
+
+def _depth(base: GateBase) -> int:
+    descriptor = ParameterDescriptor(
+        description="Commands kept per topic while they wait to be relayed or delivered.",
+        read_only=True,
+        integer_range=[IntegerRange(from_value=1, to_value=1000, step=1)],
+    )
+    value: int = base.declare_parameter("depth", 10, descriptor).value
+    return value
