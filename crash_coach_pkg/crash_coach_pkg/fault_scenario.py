@@ -14,6 +14,8 @@ from pydantic import Field
 from crash_coach_pkg.config import FaultConfig, TeamSpec
 from crash_coach_pkg.draws import check_team, draw_faults, draw_victims, most_crashed
 from crash_coach_pkg.expectations import Expectation
+from crash_coach_pkg.faults import unmet_needs
+from crash_coach_pkg.faults.base import Need
 from crash_coach_pkg.plan import CrashPlan, Fault
 from sim_pkg.config import ConfigError, StrictModel, YamlTree, did_you_mean, load_tree, validate
 from sim_pkg.contract import UserError
@@ -57,11 +59,20 @@ class FaultScenario:
     def expect(self) -> tuple[Expectation, ...]:
         return self.config.expect
 
-    def check(self, team: TeamSpec, episode_limit: int | None = None) -> None:
-        """Holds the faults against a team, and against a scenario's longest episode in steps.
+    def check(
+        self,
+        team: TeamSpec,
+        episode_limit: int | None = None,
+        offered: frozenset[Need] | None = None,
+    ) -> None:
+        """Holds the faults against a team.
+
+        Args:
+            episode_limit: steps of the scenario's longest episode; None: unknown.
+            offered: what modes may ask of the team's commands; None: unknown.
 
         Raises:
-            ConfigError: a victim, role, limit or step that is out of reach, with its line.
+            ConfigError: a victim, role, limit, step or mode that is out of reach, with its line.
         """
         for entry, fault in enumerate(self.faults):
             if episode_limit is not None and fault.start_step >= episode_limit:
@@ -70,6 +81,8 @@ class FaultScenario:
                     f"start_step {fault.start_step} is never reached: episodes have at most "
                     f"{episode_limit} steps, the last is {episode_limit - 1}",
                 )
+            if offered is not None and (reason := unmet_needs(fault.crash_mode, offered)):
+                raise self._error(entry, f"crash_mode: {reason}")
             try:
                 check_team(fault, team)
             except UserError as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from crash_coach_pkg.effects import EffectRow
@@ -44,7 +44,6 @@ class FaultRun:
 
     faulted: Evaluation
     crash_free: Evaluation
-    effects: tuple[EffectRow, ...]
     trials: Trials
     verdicts: tuple[Verdict, ...]
     entries: tuple[EntryEffects, ...]
@@ -60,39 +59,34 @@ def judge_run(
     planner: ScenarioPlanner,
     faulted: Evaluation,
     crash_free: Evaluation,
-    effects: Sequence[EffectRow],
 ) -> FaultRun:
     """Pairs the episodes and judges the scenario's expectations.
 
     Args:
-        effects: of the faulted episodes, in any order.
+        faulted: with its effects.
 
     Raises:
         ValueError: the evaluations are not the same episodes of the same seed.
     """
-    trials = Trials(len(scenario.faults), _pairs(planner, faulted, crash_free, effects))
+    trials = Trials(len(scenario.faults), _pairs(planner, faulted, crash_free))
     verdicts = tuple(_verdict(expectation, trials) for expectation in scenario.expect)
     modes = [fault.crash_mode for fault in scenario.faults]
-    entries = tuple(_entry(i, mode, trials, effects) for i, mode in enumerate(modes))
-    ordered = tuple(sorted(effects))
-    return FaultRun(faulted, crash_free, ordered, trials, verdicts, entries)
+    entries = tuple(_entry(i, mode, trials, faulted.effects) for i, mode in enumerate(modes))
+    return FaultRun(faulted, crash_free, trials, verdicts, entries)
 
 
 def _pairs(
-    planner: ScenarioPlanner,
-    faulted: Evaluation,
-    crash_free: Evaluation,
-    effects: Sequence[EffectRow],
+    planner: ScenarioPlanner, faulted: Evaluation, crash_free: Evaluation
 ) -> tuple[Pair, ...]:
     keys = [[(run.seed, e.episode) for e in run.episodes] for run in (faulted, crash_free)]
     if keys[0] != keys[1]:
         raise ValueError(f"episodes {keys[0]} with faults, {keys[1]} without: they are not paired")
     rows: dict[int, list[EffectRow]] = {e.episode: [] for e in faulted.episodes}
-    for row in effects:
+    for row in faulted.effects:
         rows[row.episode].append(row)
     return tuple(
-        _pair(planner.plan(with_faults.episode), faulted.robots, with_faults, without, rows)
-        for with_faults, without in zip(faulted.episodes, crash_free.episodes, strict=True)
+        _pair(planner.plan(under.episode), faulted.robots, under, free, rows[under.episode])
+        for under, free in zip(faulted.episodes, crash_free.episodes, strict=True)
     )
 
 
@@ -101,11 +95,10 @@ def _pair(
     robots: tuple[str, ...],
     faulted: EpisodeResult,
     crash_free: EpisodeResult,
-    rows: Mapping[int, Sequence[EffectRow]],
+    rows: Sequence[EffectRow],
 ) -> Pair:
-    of_episode = rows[faulted.episode]
-    active = {(row.entry, row.robot) for row in of_episode if row.kind == "ACTIVE"}
-    took_effect = {(row.entry, row.robot) for row in of_episode if row.kind == "EFFECT"}
+    active = {(row.entry, row.robot) for row in rows if row.kind == "ACTIVE"}
+    took_effect = {(row.entry, row.robot) for row in rows if row.kind == "EFFECT"}
     due = set()
     for fault in plan.faults:
         key = (fault.entry, robots[fault.robot])
@@ -116,7 +109,7 @@ def _pair(
         episode=faulted.episode,
         crash_free=_outcome(crash_free),
         faulted=_outcome(faulted),
-        crashed=len({robot for _, robot in took_effect}),
+        crashed=len(faulted.crashed),
         due=tuple(DueFault(*key, key in took_effect) for key in sorted(due)),
     )
 

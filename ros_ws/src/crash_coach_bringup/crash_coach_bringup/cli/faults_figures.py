@@ -85,7 +85,7 @@ def returns(run: FaultRun) -> Figure:
 
 def timeline(run: FaultRun) -> Figure:
     """Which fault was in force on which robot, in the first episode that had one."""
-    effects = [row for row in run.effects if row.kind == "EFFECT"]
+    effects = [row for row in run.faulted.effects if row.kind == "EFFECT"]
     episode = effects[0].episode if effects else run.faulted.episodes[0].episode
     (steps,) = (e.steps for e in run.faulted.episodes if e.episode == episode)
     robots = run.faulted.robots

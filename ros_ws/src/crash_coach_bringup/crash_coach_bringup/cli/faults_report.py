@@ -121,7 +121,7 @@ def _replace(out: Path, content: Mapping[str, bytes]) -> None:
 
 def events(run: FaultRun) -> str:
     """One JSON object per line: the effect log, sorted, of the faulted episodes."""
-    return "".join(json.dumps(row._asdict()) + "\n" for row in run.effects)
+    return "".join(json.dumps(row._asdict()) + "\n" for row in run.faulted.effects)
 
 
 def events_sha256(run: FaultRun) -> str:
@@ -164,7 +164,8 @@ def junit(played: Played, run: FaultRun) -> str:
     suite = ElementTree.SubElement(root, "testsuite", {**about, "skipped": "0", **counts})
     properties = ElementTree.SubElement(suite, "properties")
     for key, value in played.reproducible().items():
-        ElementTree.SubElement(properties, "property", name=key, value=_xml(str(value)))
+        if value is not None:
+            ElementTree.SubElement(properties, "property", name=key, value=_xml(str(value)))
     for verdict in run.verdicts:
         _case(suite, played, verdict)
     ElementTree.indent(root)
@@ -216,7 +217,7 @@ def report(played: Played, run: FaultRun) -> str:
             ((e.entry, e.mode, e.due, e.took_effect, e.robot_steps) for e in run.entries),
         ),
         "![Faults of one episode over time](timeline.png)",
-        f"Effect log: {len(run.effects)} events, SHA-256 `{events_sha256(run)}`.",
+        f"Effect log: {len(run.faulted.effects)} events, SHA-256 `{events_sha256(run)}`.",
     ]
     return "\n\n".join(parts) + "\n"
 

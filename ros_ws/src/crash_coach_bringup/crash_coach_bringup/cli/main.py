@@ -12,6 +12,7 @@ from crash_coach_bringup.cli import (
     demo,
     doctor,
     evaluate,
+    faults,
     inject,
     plot,
     render,
@@ -34,6 +35,7 @@ app = typer.Typer(
 app.command("doctor")(doctor.doctor)
 app.command("train")(train.train)
 app.command("evaluate")(evaluate.evaluate)
+app.add_typer(faults.app, name="faults")
 app.command("up")(up.up)
 app.command("inject")(inject.inject)
 app.command("demo")(demo.demo)
