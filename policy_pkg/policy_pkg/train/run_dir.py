@@ -25,6 +25,7 @@ from typing import Any
 
 from policy_pkg.checkpoint import CHECKPOINTS
 from policy_pkg.train.config import TrainConfig
+from policy_pkg.train.offline_config import OfflineConfig
 from sim_pkg.contract import UserError
 
 RUN = "run.json"
@@ -32,6 +33,7 @@ METRICS = "metrics.jsonl"
 TIMING = "timing.jsonl"
 TENSORBOARD = "tensorboard"
 FORMAT = "crash-coach-run"
+RunConfig = TrainConfig | OfflineConfig
 LIBRARIES = ("numpy", "torch", "pymunk", "numba")
 
 
@@ -39,18 +41,24 @@ class RunError(UserError):
     """A run directory that cannot be used as asked."""
 
 
-def prepare_run(out_dir: Path, config: TrainConfig, resume: bool) -> None:
+def prepare_run(
+    out_dir: Path, config: RunConfig, resume: bool, data: dict[str, Any] | None = None
+) -> None:
     """Makes ``out_dir`` a run of ``config``; with ``resume``, one that is there already will do.
+
+    data: describes the data set of an offline run, by its ``sha256`` among others.
 
     Raises:
         RunError: it holds a run and ``resume`` is off; that run has another config (the text
-            names the first key that differs); or ``out_dir`` holds other things.
+            names the first key that differs) or data set; or ``out_dir`` holds other things.
     """
     described = out_dir / RUN
     if described.exists():
         if not resume:
             raise RunError(f"{out_dir} already holds a run: resume it, or choose another directory")
-        _check_same(read_run(out_dir), config, described)
+        run = read_run(out_dir)
+        _check_same(run, config, described)
+        _check_same_data(run, data, out_dir)
         return
     # A .partial file is what a killed process leaves.
     if out_dir.is_dir() and any(p.suffix != ".partial" for p in out_dir.iterdir()):
@@ -59,7 +67,7 @@ def prepare_run(out_dir: Path, config: TrainConfig, resume: bool) -> None:
         raise RunError(f"{out_dir} is a file: choose another directory")
     out_dir.mkdir(parents=True, exist_ok=True)
     partial = described.with_name(RUN + ".partial")
-    partial.write_text(json.dumps(describe_run(config), indent=1) + "\n", encoding="utf-8")
+    partial.write_text(json.dumps(describe_run(config, data), indent=1) + "\n", encoding="utf-8")
     partial.rename(described)
 
 
@@ -81,13 +89,14 @@ def read_run(out_dir: Path) -> dict[str, Any]:
     return content
 
 
-def describe_run(config: TrainConfig) -> dict[str, Any]:
+def describe_run(config: RunConfig, data: dict[str, Any] | None = None) -> dict[str, Any]:
     """What it takes to repeat the run. ``commit`` is null outside a git checkout."""
     return {
         "format": FORMAT,
         "version": 1,
         "config": config.model_dump(mode="json"),
         "seed": config.seed,
+        **({} if data is None else {"data": data}),
         "versions": {
             "python": platform.python_version(),
             **{name: version(name) for name in LIBRARIES},
@@ -109,7 +118,7 @@ def _commit() -> str | None:
     return done.stdout.strip() or None
 
 
-def _check_same(run: dict[str, Any], config: TrainConfig, path: Path) -> None:
+def _check_same(run: dict[str, Any], config: RunConfig, path: Path) -> None:
     before = _flat(run.get("config", {}))
     now = _flat(config.model_dump(mode="json"))
     for key in sorted({*before, *now}):
@@ -119,6 +128,17 @@ def _check_same(run: dict[str, Any], config: TrainConfig, path: Path) -> None:
                 f"{path.parent} was started with {key} = {old!r}, not {new!r}: "
                 "a run is resumed with the config it was started with"
             )
+
+
+def _check_same_data(run: dict[str, Any], data: dict[str, Any] | None, out_dir: Path) -> None:
+    if data is None:
+        return
+    before = run.get("data", {})
+    if before.get("sha256") != data["sha256"]:
+        raise RunError(
+            f"{out_dir} was started with other recordings ({before.get('episodes')} episodes, now "
+            f"{data['episodes']}): a run is resumed with the recordings it was started with"
+        )
 
 
 def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -16,11 +16,11 @@ from safetensors.numpy import save_file
 from policy_pkg.checkpoint import CHECKPOINTS, list_checkpoints
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.learner import DivergedError
-from policy_pkg.train.metrics import JsonLines, Value
-from policy_pkg.train.run_dir import METRICS, TENSORBOARD, TIMING, locked, prepare_run
+from policy_pkg.train.metrics import Value
+from policy_pkg.train.run_dir import locked, prepare_run
+from policy_pkg.train.run_log import RunLog
 from policy_pkg.train.session import TEST_ARENAS, Session
 from policy_pkg.train.snapshot import Logged, restore, save
-from policy_pkg.train.tensorboard import TensorBoard
 from sim_pkg.contract import BatchEnv, UserError
 from sim_pkg.env import make_env
 
@@ -122,16 +122,11 @@ class _Trainer:
         found = list_checkpoints(out_dir / CHECKPOINTS)
         self._checkpoint = found[-1] if found else None
         logged = restore(found[-1], session) if found else Logged()
-        self._last_block: dict[str, Value] = logged.last_block or {}
-        self._metrics = JsonLines(out_dir / METRICS, logged.metrics_bytes)
-        self._timing = JsonLines(out_dir / TIMING, logged.timing_bytes)
-        self._board: TensorBoard | None = None
-        if session.config.tensorboard and not session.finished:
-            self._board = TensorBoard(out_dir / TENSORBOARD, session.counters.env_steps)
-        self._saved_steps = session.counters.env_steps
-        self._started_s = self._reported_s = self._block_s = clock()
-        self._block_steps = session.counters.env_steps
-        self._marks = deque([(self._started_s, self._block_steps)])
+        self._saved_steps = steps = session.counters.env_steps
+        self._started_s = self._reported_s = clock()
+        board = session.config.tensorboard and not session.finished
+        self._log = RunLog(out_dir, logged, self._started_s, steps, "env_steps", board)
+        self._marks = deque([(self._started_s, steps)])
         self._warning: str | None = None
 
     def run(self) -> TrainSummary:
@@ -147,56 +142,34 @@ class _Trainer:
         return self._summary()
 
     def _block_is_new(self) -> bool:
-        return self._last_block.get("env_steps") != self._session.counters.env_steps
+        return self._log.last_block.get("env_steps") != self._session.counters.env_steps
 
     def _collect(self) -> None:
         try:
             self._session.collect()
         except DivergedError as error:
-            raise TrainError(self._keep_batch(error)) from error
+            steps = self._session.counters.env_steps
+            raise TrainError(keep_batch(self._out_dir, steps, error)) from error
         if self._clock() - self._reported_s >= REPORT_INTERVAL_S:
             self._report("training")
-
-    def _keep_batch(self, error: DivergedError) -> str:
-        """Saves the batch that made the learner diverge; returns what to tell."""
-        path = self._out_dir / f"diverged_{self._session.counters.env_steps:09d}.safetensors"
-        try:
-            save_file(error.batch.arrays(), path)
-        except (OSError, SafetensorError) as failure:
-            return f"training in {self._out_dir}: {error}; the batch was not saved: {failure}"
-        return f"training in {self._out_dir}: {error}; the batch is in {path}"
 
     def _block(self) -> None:
         session = self._session
         self._report("evaluation")
-        self._last_block = session.end_block(session.test())
-        self._log(self._last_block)
-        due = session.counters.env_steps - self._saved_steps
-        if due and (due >= session.config.checkpoint_interval_steps or session.finished):
-            self._save()
-
-    def _log(self, line: dict[str, Value]) -> None:
-        steps, now = self._session.counters.env_steps, self._clock()
-        spent_s = now - self._block_s
-        speed = (steps - self._block_steps) / spent_s if spent_s > 0 else None
-        self._block_s, self._block_steps = now, steps
-        timing = {"env_steps": steps, "wall_s": now - self._started_s, "steps_per_s": speed}
-        self._metrics.append(line)
-        self._timing.append(timing)
+        line, steps = session.end_block(session.test()), session.counters.env_steps
         try:
-            self._metrics.flush()
-            self._timing.flush()
-            if self._board is not None:
-                self._board.write(line, steps)
+            self._log.write(line, self._clock(), steps)
         except OSError as error:
             self._report("training", f"metrics at {steps} steps wait to be written: {error}")
+        due = steps - self._saved_steps
+        if due and (due >= session.config.checkpoint_interval_steps or session.finished):
+            self._save()
 
     def _save(self) -> None:
         session, steps = self._session, self._session.counters.env_steps
         self._report("checkpoint")
         try:
-            logged = Logged(self._metrics.sync(), self._timing.sync(), self._last_block)
-            self._checkpoint = save(self._out_dir, session, logged)
+            self._checkpoint = save(self._out_dir, session, self._log.sync())
             self._saved_steps = steps
         except OSError as error:
             problem = f"checkpoint at {steps} steps was not written: {error}"
@@ -225,8 +198,8 @@ class _Trainer:
             total_steps=total,
             alpha=session.coach.rate,
             epsilon=session.config.epsilon(steps),
-            success_rate=_number(self._last_block.get("success_rate")),
-            success_crash_free=_number(self._last_block.get("success_crash_free")),
+            success_rate=_number(self._log.last_block.get("success_rate")),
+            success_crash_free=_number(self._log.last_block.get("success_crash_free")),
             steps_per_s=speed,
             eta_s=max(0, total - steps) / speed if moving else 0.0,
             warning=self._warning,
@@ -246,14 +219,21 @@ class _Trainer:
             gradient_steps=session.learner.updates,
             alpha=session.coach.rate,
             wall_s=self._clock() - self._started_s,
-            last_block=self._last_block,
+            last_block=self._log.last_block,
         )
 
     def close(self) -> None:
-        self._metrics.close()
-        self._timing.close()
-        if self._board is not None:
-            self._board.close()
+        self._log.close()
+
+
+def keep_batch(out_dir: Path, steps: int, error: DivergedError) -> str:
+    """Saves the batch that made the learner diverge; returns what to tell."""
+    path = out_dir / f"diverged_{steps:09d}.safetensors"
+    try:
+        save_file(error.batch.arrays(), path)
+    except (OSError, SafetensorError) as failure:
+        return f"training in {out_dir}: {error}; the batch was not saved: {failure}"
+    return f"training in {out_dir}: {error}; the batch is in {path}"
 
 
 def _number(value: Value) -> float | None:
