@@ -26,6 +26,7 @@ from crash_coach_bringup.ros.graph import (
     graph_processes,
 )
 from crash_coach_bringup.ros.supervisor import Supervisor
+from crash_coach_pkg.config import TeamSpec
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 
@@ -124,7 +125,7 @@ def lockstep_steps_per_s(folder: Path, robots: int, layout: Layout, gate: bool) 
     with (
         reserve_domain() as domain,
         Supervisor(
-            graph_processes(options, spec.robots),
+            graph_processes(options, TeamSpec.of(spec)),
             folder / "logs",
             graph_environment(domain),
             throughput=True,

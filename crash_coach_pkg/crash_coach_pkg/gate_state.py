@@ -7,10 +7,10 @@ each of them.
 
 from __future__ import annotations
 
-from crash_coach_pkg.action_tools import UNTOLD, ActionTools
+from crash_coach_pkg.action_tools import ACTION_OFFERS, UNTOLD, ActionTools
 from crash_coach_pkg.effects import OBSERVED, WITHHELD
-from crash_coach_pkg.faults import fault_mode
-from crash_coach_pkg.faults.base import Need, ObservationFault
+from crash_coach_pkg.faults import fault_mode, is_observation_mode
+from crash_coach_pkg.faults.base import Need
 from crash_coach_pkg.gate_types import (
     Command,
     Decision,
@@ -25,7 +25,6 @@ from crash_coach_pkg.schedule import World
 from crash_coach_pkg.team_faults import TeamFaults
 from sim_pkg.contract import BoolArray
 
-OFFERED: frozenset[Need] = frozenset(("availability", "sampler", "worst"))
 _FROM_OBSERVATION: frozenset[Need] = frozenset(("availability", "sampler"))
 
 
@@ -88,7 +87,7 @@ class GateState:
         return any(f.trigger.needs_world for plan in self.book.plans for f in plan.faults)
 
     def _why_not(self, plan: CrashPlan) -> str:
-        return why_not(plan, OFFERED, self._relays)
+        return why_not(plan, ACTION_OFFERS, self._relays)
 
     # --- what comes in ----------------------------------------------------------------------
 
@@ -212,7 +211,7 @@ class GateState:
         if passed is not None:
             stream.passed = passed
         applied = WITHHELD if passed is None else passed
-        of_sight = bool(mode) and issubclass(fault_mode(mode), ObservationFault)
+        of_sight = bool(mode) and is_observation_mode(mode)
         return Decision(command, mode, entry, applied, term.revision, observation=of_sight)
 
     # --- observations -----------------------------------------------------------------------
@@ -242,7 +241,9 @@ class GateState:
             seen = stream.team.observation(robot, sight.features)
             mode = stream.team.observation_mode(robot)
             if mode:
-                outputs.append(self._effect(sight, mode, stream.running[-1].entry, term))
+                outputs.append(
+                    self._effect(sight, mode, stream.team.observation_entry(robot), term)
+                )
         stream.seen = seen
         made = Seen(sight, None if seen is sight.features else seen)
         self._seen[robot] = made

@@ -12,8 +12,8 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from crash_coach_pkg.effects import NO_ACTION
-from crash_coach_pkg.faults import check_parameters, fault_mode, unmet_needs
-from crash_coach_pkg.faults.base import Need, ObservationFault
+from crash_coach_pkg.faults import check_parameters, is_observation_mode, unmet_needs
+from crash_coach_pkg.faults.base import Need
 from crash_coach_pkg.plan import CrashPlan
 from sim_pkg.contract import UserError
 
@@ -60,13 +60,12 @@ def why_not(plan: CrashPlan, offered: frozenset[Need], observations: bool) -> st
     """
     for fault in plan.faults:
         try:
-            mode = fault_mode(fault.mode)
             check_parameters(fault.mode, dict(fault.parameters))
         except UserError as error:
             return str(error)
         if unmet := unmet_needs(fault.mode, offered):
             return unmet
-        if issubclass(mode, ObservationFault) and not observations:
+        if is_observation_mode(fault.mode) and not observations:
             return (
                 f"fault {fault.mode} changes observations, which this gate does not relay: start "
                 "it with relay_observations:=true, and the policies with "

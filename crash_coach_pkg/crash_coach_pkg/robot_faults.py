@@ -11,8 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from crash_coach_pkg.faults import fault_mode
-from crash_coach_pkg.faults.base import CommandFault
+from crash_coach_pkg.faults import is_observation_mode
 from crash_coach_pkg.plan import Fault
 from crash_coach_pkg.plan_book import Event, EventKind, Term
 from crash_coach_pkg.schedule import World
@@ -76,8 +75,7 @@ class RobotFaults:
 
     def _changed(self, change: Change, term: Term) -> list[Event]:
         fault = change.fault
-        mine = issubclass(fault_mode(fault.mode), CommandFault) == self._commands
-        if fault.robot != self.robot or not mine:
+        if fault.robot != self.robot or is_observation_mode(fault.mode) == self._commands:
             return []
         if change.began:
             self.running.append(fault)

@@ -21,6 +21,7 @@ from crash_coach_bringup.ros.graph import (
     node_process,
 )
 from crash_coach_bringup.ros.launch_arguments import ARGUMENTS, options_from
+from crash_coach_pkg.config import TeamSpec
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 
@@ -114,7 +115,9 @@ def test_every_launch_argument_reaches_the_graph(checkpoint: Path) -> None:
         }
     )
     assert options == UpOptions("buttons", checkpoint, "lockstep", "team", seed=7, episodes=3)
-    parameters = {node.name: node.parameters for node in graph_nodes(options, ("robot_1",))}
+    parameters = {
+        node.name: node.parameters for node in graph_nodes(options, TeamSpec(("robot_1",)))
+    }
     assert parameters["sim"]["seed"] == parameters["coach"]["seed"] == 7
     assert parameters["sim"]["episodes"] == 3
     assert parameters["gate"]["lockstep"] is True

@@ -12,15 +12,18 @@ from typing import Literal
 
 from crash_coach_bringup.ros import discovery
 from crash_coach_bringup.ros.probe import find_executable
-from crash_coach_pkg.config import CoachConfig
+from crash_coach_pkg.config import CoachConfig, FaultConfig, TeamSpec
+from crash_coach_pkg.fault_scenario import load_fault_scenario
+from crash_coach_pkg.faults import check_parameters, fault_mode, is_observation_mode
 from policy_pkg.checkpoint import load_policy
 from sim_pkg.contract import UserError
 from sim_pkg.env import make_env
 
 Mode = Literal["lockstep", "realtime"]
 Layout = Literal["nodes", "team", "single"]
-Value = bool | int | float | str | Sequence[str]
+Value = bool | int | float | str | Sequence[str] | Sequence[float]
 
+LOST_STEPS = 3  # without a command, as the sim's own default
 DOMAIN_LIMIT = 232  # rmw: higher ids have no valid UDP ports
 
 
@@ -33,9 +36,11 @@ class UpOptions:
     """A graph: which scenario, which policies, how many processes.
 
     ``layout``: ``nodes`` has a policy process per robot, ``team`` one for all policies,
-    ``single`` one process for everything. ``coach`` holds the coach's settings at start;
-    ``sim`` further parameters of the sim. ``gate`` false leaves coach and gate out: the
-    policies command the robots directly.
+    ``single`` one process for everything. ``coach`` holds the coach's settings at start, which
+    the file ``fault_scenario`` overrules; ``sim`` further parameters of the sim.
+    ``relay_observations``: observations pass through the gate, so that faults of them can be
+    injected later; where the coach starts with such faults, they do anyway. ``gate`` false leaves
+    coach and gate out: the policies command the robots directly.
     """
 
     scenario: str
@@ -47,6 +52,8 @@ class UpOptions:
     autostart: bool = True
     gate: bool = True
     coach: CoachConfig = field(default_factory=CoachConfig)
+    fault_scenario: Path | None = None
+    relay_observations: bool = False
     sim: Mapping[str, Value] = field(default_factory=dict)
     domain: int | None = None  # None: ROS_DOMAIN_ID, or 0
     log_dir: Path = Path("runs/up")
@@ -100,14 +107,43 @@ def ros_arguments(start: list[str], prefix: str, parameters: Mapping[str, Value]
     return [*arguments, "--"]
 
 
-def coach_parameters(config: CoachConfig, robots: Sequence[str], seed: int) -> dict[str, Value]:
-    """The coach node's parameters; settings that are null or default keep the node's default."""
+def coach_parameters(options: UpOptions, team: TeamSpec) -> dict[str, Value]:
+    """The coach node's parameters; settings that are null or default keep the node's default.
+
+    Raises:
+        UserError: a parameter that the crash mode does not have.
+    """
+    config = options.coach
+    parameters: dict[str, Value] = {"robots": list(team.robots), "seed": options.seed}
+    if team.roles:
+        parameters["roles"] = list(team.roles)
+    if team.dt_s is not None:
+        parameters["dt_s"] = team.dt_s
+    if options.fault_scenario is not None:
+        return {**parameters, "fault_scenario": str(options.fault_scenario.resolve())}
     chosen = config.model_dump(exclude_defaults=True, exclude_none=True)
-    return {"robots": list(robots), "seed": seed, "strategy": config.strategy, **chosen}
+    checked = check_parameters(config.crash_mode, chosen.pop("crash_parameters", {}))
+    mode = fault_mode(config.crash_mode).name
+    of_mode = {f"{mode}.{k}": v for k, v in checked.model_dump(exclude_unset=True).items()}
+    return {**parameters, "strategy": config.strategy, **chosen, **of_mode}
 
 
-def check_team(options: UpOptions) -> tuple[str, ...]:
-    """Loads scenario and checkpoint and returns the robots' names.
+def relays_observations(options: UpOptions) -> bool:
+    """Whether policies act on what the gate lets them see.
+
+    Raises:
+        UserError: an unknown mode, or a fault scenario that cannot be read.
+    """
+    faults: Sequence[FaultConfig] = (options.coach,)
+    if options.fault_scenario is not None:
+        faults = load_fault_scenario(options.fault_scenario).faults
+    return options.gate and (
+        options.relay_observations or any(is_observation_mode(f.crash_mode) for f in faults)
+    )
+
+
+def check_team(options: UpOptions) -> TeamSpec:
+    """Loads scenario and checkpoint and returns the team.
 
     Raises:
         sim_pkg.config.ConfigError: no such scenario.
@@ -115,30 +151,35 @@ def check_team(options: UpOptions) -> tuple[str, ...]:
     """
     spec = make_env(options.scenario, 1).spec
     load_policy(options.checkpoint).check_spec(spec)
-    return spec.robots
+    return TeamSpec.of(spec)
 
 
-def graph_nodes(options: UpOptions, robots: Sequence[str]) -> list[Node]:
+def graph_nodes(options: UpOptions, team: TeamSpec) -> list[Node]:
     """The graph's nodes, the sim last: the others are ready to answer when it starts."""
     acting: dict[str, Value] = {
         "checkpoint": str(options.checkpoint.resolve()),
         "command_topic": "command_raw" if options.gate else "command",
     }
+    relays = relays_observations(options)
+    if relays:
+        acting["observation_topic"] = "observation_seen"
     nodes: list[Node] = []
     if options.gate:
-        coach = coach_parameters(options.coach, robots, options.seed)
         gate: dict[str, Value] = {
-            "robots": list(robots),
+            "robots": list(team.robots),
             "lockstep": options.mode == "lockstep",
+            "relay_observations": relays,
         }
+        if options.mode == "realtime" and team.dt_s is not None:
+            gate["cmd_timeout_s"] = LOST_STEPS * team.dt_s
         nodes += [
             Node("gate", "crash_coach_pkg", "gate", gate),
-            Node("coach", "crash_coach_pkg", "coach", coach),
+            Node("coach", "crash_coach_pkg", "coach", coach_parameters(options, team)),
         ]
     if options.layout == "nodes":
         nodes += [
             Node(f"policy_{name}", "policy_pkg", "policy", {"robot": name, **acting})
-            for name in robots
+            for name in team.robots
         ]
     else:
         nodes.append(Node("team", "policy_pkg", "team", acting))
@@ -153,9 +194,9 @@ def graph_nodes(options: UpOptions, robots: Sequence[str]) -> list[Node]:
     return [*nodes, Node("sim", "sim_pkg", "sim", sim)]
 
 
-def graph_processes(options: UpOptions, robots: Sequence[str]) -> list[Process]:
+def graph_processes(options: UpOptions, team: TeamSpec) -> list[Process]:
     """The processes of the layout. Raises GraphError where an executable is not installed."""
-    nodes = graph_nodes(options, robots)
+    nodes = graph_nodes(options, team)
     if options.layout == "single":
         return [single_process(nodes)]
     return [node_process(node) for node in nodes]
