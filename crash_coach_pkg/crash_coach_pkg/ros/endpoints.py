@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+UNKNOWN = "_NODE_NAME_UNKNOWN_"  # rmw's word
+
 
 class Endpoint(NamedTuple):
     """A publisher on the graph. ``gid`` is unique, ``node`` (with namespace) need not be."""
@@ -52,6 +54,7 @@ class WatchedPublisher:
         # after their discovery.
         self._own = {e.gid for e in publishers_on(node, topic) - before if e.node == name}
         self._seen: frozenset[Endpoint] = frozenset()
+        self._met: set[str] = set()
         self.topic: str = self._publisher.topic_name
         self.publish = self._publisher.publish
         """A message, or its serialized bytes."""
@@ -61,10 +64,20 @@ class WatchedPublisher:
         """As of the last look, in a fixed order."""
         return tuple(sorted(self._seen))
 
+    def _nameless(self, endpoint: Endpoint) -> bool:
+        """At the first look at it: a node's name comes a little later than its publishers.
+
+        A publisher that is no ROS node's never has a name.
+        """
+        if UNKNOWN not in endpoint.node or endpoint.gid in self._met:
+            return False
+        self._met.add(endpoint.gid)
+        return True
+
     def look(self) -> Sighting:
         """Asks the graph; call at a low rate."""
         found = publishers_on(self._node, self.topic)
-        now = frozenset(e for e in found if e.gid not in self._own)
+        now = frozenset(e for e in found if e.gid not in self._own and not self._nameless(e))
         sighting = Sighting(tuple(sorted(now - self._seen)), tuple(sorted(self._seen - now)))
         self._seen = now
         return sighting
