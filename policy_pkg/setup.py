@@ -9,7 +9,7 @@ setup(
     maintainer="Crash Coach engineers",
     maintainer_email="team@crash-coach.dev",
     license="Apache-2.0",
-    packages=["policy_pkg", "policy_pkg.ros", "policy_pkg.train"],
+    packages=["policy_pkg", "policy_pkg.bags", "policy_pkg.ros", "policy_pkg.train"],
     package_data={"policy_pkg": ["configs/**/*.yaml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
@@ -20,6 +20,7 @@ setup(
     entry_points={
         "console_scripts": [
             "policy = policy_pkg.ros.policy_node:main",
+            "recorder = policy_pkg.ros.recorder_node:main",
             "team = policy_pkg.ros.team_node:main",
         ],
     },

@@ -1,0 +1,76 @@
+"""The recorder's parameters: one strict model, declared from it and validated by it."""
+
+from __future__ import annotations
+
+import re
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.node import Node
+
+from sim_pkg.contract import UserError
+
+_OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides")
+_NOT_TOLD = -1
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+
+
+class RecorderParameters(BaseModel):
+    """Read once at start-up. What describes the team goes into the recording as it is told."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    out: str = Field("", description="folder of the recording; must not exist, or be empty")
+    robots: list[str] = Field([""], description="names of the team's robots, in order")
+    scenario: str = Field("", description="name or path of the scenario")
+    seed: int = Field(_NOT_TOLD, ge=-1, le=2**63 - 1, description="of the sim; -1: not told")
+    mode: Literal["lockstep", "realtime"] = Field("lockstep", description="of the sim")
+    stay_actions: list[int] = Field([_NOT_TOLD], description="no-move actions; -1: not told")
+    dt_s: float = Field(0.0, ge=0, le=3600, description="control step; 0: not told")
+    episode_limit: int = Field(0, ge=0, le=10**6, description="longest episode; 0: not told")
+    odometry: bool = Field(False, description="also record odom; the sim then has to build it")
+    seen: bool = Field(False, description="also record observation_seen of a relaying gate")
+    split_bytes: int = Field(1 << 30, ge=0, le=2**40, description="new file after; 0: never")
+    split_episodes: int = Field(0, ge=0, le=10**9, description="new file after; 0: never")
+    compression: Literal["zstd", "lz4", "none"] = Field("zstd", description="of the chunks")
+    queue_messages: int = Field(
+        100_000, ge=1, le=10**7, description="most messages that wait to be written"
+    )
+    episodes: int = Field(0, ge=0, le=10**9, description="end after so many; 0: run on")
+
+
+def read_parameters(node: Node) -> RecorderParameters:
+    """Declares the parameters on ``node`` and returns what was set on the command line.
+
+    Raises:
+        UserError: an unknown name, a wrong type, a value out of range, or no out or robots.
+    """
+    known = RecorderParameters.model_fields
+    for name in node._parameter_overrides:
+        if name not in known and name.split(".")[0] not in _OF_RCLPY:
+            raise UserError(f"unknown parameter {name!r} of recorder; known: {', '.join(known)}")
+    values: dict[str, Any] = {}
+    for name, about in known.items():
+        # Typed by the model, which says more than a type mismatch in rclpy does.
+        descriptor = ParameterDescriptor(
+            description=about.description, read_only=True, dynamic_typing=True
+        )
+        value = node.declare_parameter(name, about.default, descriptor).value
+        values[name] = value if isinstance(value, str | int | float) else list(value)
+    try:
+        parameters = RecorderParameters.model_validate(values)
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]
+        name = ".".join(map(str, problem["loc"]))
+        raise UserError(f"parameter {name} = {problem['input']!r}: {problem['msg']}") from error
+    for name in ("out", "robots"):
+        if getattr(parameters, name) in ("", [""]):
+            raise UserError(f"parameter {name!r} of recorder is missing: {known[name].description}")
+    robots = parameters.robots
+    if len(set(robots)) != len(robots) or not all(map(_NAME.fullmatch, robots)):
+        raise UserError(
+            f"parameter robots = {robots}: every robot needs a name of its own, of letters, "
+            "digits and _, which does not begin with a digit"
+        )
+    return parameters

@@ -1,0 +1,274 @@
+"""Recorded episodes for training: bags to Episodes, each held against its trajectory hash."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from crash_coach_pkg.faults import mode_code
+from crash_coach_pkg.plan import CrashPlan, Fault, Trigger, TriggerKind
+from policy_pkg.bags.about import About
+from policy_pkg.bags.assemble import (
+    ContradictionError,
+    IncompleteError,
+    Joined,
+    Wanted,
+    assemble,
+    counts_suffice,
+)
+from policy_pkg.bags.bag import Bag, Scan, find_bags
+from policy_pkg.bags.join import MEMORY_BYTES, Joiner, Pieces
+from policy_pkg.bags.problems import BagError, Problem, Report, Severity, refuse
+from policy_pkg.bags.topics import Kind
+from policy_pkg.train.episode import Episode
+from sim_pkg.contract import IntArray, UserError
+from sim_pkg.trajectory import TrajectoryHash
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RecordedEpisode:
+    """An episode of a bag.
+
+    ``episode.obs`` is what the policies saw; its entry T, and that of ``available``, is zero where
+    the episode terminated: nobody observes there, and the learner multiplies it by zero.
+    """
+
+    bag: str
+    robots: tuple[str, ...]
+    seed: int
+    number: int
+    episode: Episode
+    intents: IntArray  # (T, n) actions that the policies wanted; -1 where not recorded
+    success: bool
+    plan: CrashPlan | None  # the last revision; None where not recorded
+    modes: dict[tuple[int, int], str]  # names of faults by (step, robot)
+    trajectory_hash: str
+
+
+@dataclass
+class BagSummary:
+    """What a bag holds, complete once its episodes have been read."""
+
+    name: str
+    files: int
+    robots: tuple[str, ...]
+    about: About | None
+    messages: int = 0
+    duration_s: float = 0.0
+    episodes: int = 0
+    steps: int = 0
+    successes: int = 0
+    crashed_robot_steps: dict[str, int] = field(default_factory=dict)  # by mode
+    crashed_episodes: int = 0
+
+    def count(self, recorded: RecordedEpisode) -> None:
+        self.episodes += 1
+        self.steps += recorded.episode.length
+        self.successes += recorded.success
+        self.crashed_episodes += bool(recorded.modes)
+        for mode in recorded.modes.values():
+            self.crashed_robot_steps[mode] = self.crashed_robot_steps.get(mode, 0) + 1
+
+
+def warn(problem: Problem) -> None:
+    """A Report that logs."""
+    _log.warning("%s", problem)
+
+
+def load_episodes(
+    paths: Sequence[Path],
+    strict: bool = False,
+    report: Report = warn,
+    memory_bytes: int = MEMORY_BYTES,
+) -> Iterator[RecordedEpisode]:
+    """Every complete episode of the bags in ``paths``, in the order in which they are complete.
+
+    Holds about one episode at a time: at most ``memory_bytes`` of messages.
+
+    Args:
+        paths: MCAP files, folders of recordings, folders of such folders.
+        strict: the first problem ends the reading; otherwise each is reported, and the episodes
+            that it concerns are left out.
+
+    Raises:
+        BagError: no recording in a path; bags of different teams; with ``strict``, any problem.
+    """
+    team: tuple[str, ...] = ()
+    for bag in find_bags(paths):
+        reading = BagReading(bag, refuse if strict else report, memory_bytes)
+        if team and reading.summary.robots and reading.summary.robots != team:
+            raise BagError(
+                f"{bag.name}: its robots are {', '.join(reading.summary.robots)}; "
+                f"those of the bags before are {', '.join(team)}"
+            )
+        team = team or reading.summary.robots
+        yield from reading.episodes()
+
+
+class BagReading:
+    """Reads one bag once; ``summary`` grows with ``episodes``."""
+
+    def __init__(self, bag: Bag, report: Report, memory_bytes: int = MEMORY_BYTES) -> None:
+        self._scan = scan = Scan(bag)
+        self._joiner = Joiner(bag, scan, report, memory_bytes)
+        self._report = report
+        self.summary = BagSummary(bag.name, len(bag.files), scan.robots, scan.about)
+
+    def episodes(self) -> Iterator[RecordedEpisode]:
+        joiner, summary = self._joiner, self.summary
+        for pieces, last in joiner.pieces():
+            recorded = self._finished(pieces, last)
+            if recorded is not None:
+                summary.count(recorded)
+                yield recorded
+        summary.about = joiner.about
+        summary.messages = joiner.messages
+        summary.duration_s = (joiner.last_ns - joiner.first_ns) * 1e-9
+        self._check_topics()
+
+    def _finished(self, pieces: Pieces, last: bool) -> RecordedEpisode | None:
+        """The episode, once nothing more of it can come; None also where it is left out."""
+        robots, joiner = self._scan.robots, self._joiner
+        wanted = self._wanted()
+        if not last and not counts_suffice(pieces, len(robots), wanted):
+            return None
+        place = f"{self.summary.name}: episode {pieces.number}"
+        try:
+            if pieces.end is not None and pieces.end.step == 0 and not pieces.conflicts:
+                recorded = None  # cut short before its first step
+            else:
+                joined = assemble(pieces, robots, wanted, joiner.decoder, last)
+                recorded = _recorded(self.summary.name, robots, pieces, joined)
+        except IncompleteError as error:
+            if not last:
+                return None
+            recorded = None
+            self._report(Problem(place, f"left out: {error}", Severity.INCOMPLETE))
+        except (ContradictionError, UserError, ValueError) as error:
+            recorded = None
+            self._report(Problem(place, f"left out: {error}"))
+        joiner.close(pieces)
+        return recorded
+
+    def _wanted(self) -> Wanted:
+        about, kinds, met = self._joiner.about, self._scan.kinds, self._joiner.met
+        return Wanted(
+            decisions=about is not None and about.mode == "lockstep",
+            effects=Kind.EVENT in kinds,
+            seen=Kind.SEEN in met,
+            intents=Kind.INTENT in kinds,
+        )
+
+    def _check_topics(self) -> None:
+        met = self._joiner.met
+        for kind, topic in (
+            (Kind.STATE, "/sim/episode"),
+            (Kind.OBSERVATION, "/<robot>/observation"),
+            (Kind.COMMAND, "/<robot>/command"),
+        ):
+            if kind not in met:
+                self._joiner.problem(f"missing topic: no message on {topic}")
+
+
+def _recorded(
+    name: str, robots: tuple[str, ...], pieces: Pieces, joined: Joined
+) -> RecordedEpisode:
+    end = joined.end
+    _check_hash(joined)
+    episode = Episode(
+        obs=joined.seen,
+        state=joined.state,
+        available=joined.available,
+        actions=joined.executed,
+        reward=joined.reward.astype(np.float32),
+        faults=_faults(joined, robots),
+        terminated=bool(end.terminated),
+    )
+    return RecordedEpisode(
+        bag=name,
+        robots=robots,
+        seed=int(end.seed),
+        number=pieces.number,
+        episode=episode,
+        intents=joined.intents,
+        success=bool(end.success),
+        plan=_plan(pieces.plan, robots) if pieces.plan is not None else None,
+        modes=joined.modes,
+        trajectory_hash=end.trajectory_hash,
+    )
+
+
+def _check_hash(joined: Joined) -> None:
+    """Raises ContradictionError where the arrays are not those that the sim hashed."""
+    end, steps = joined.end, len(joined.reward)
+    if not end.trajectory_hash:
+        raise ContradictionError("its last EpisodeState has no trajectory hash")
+    # Flags before the end are false; an end that was cut from outside is not hashed.
+    digest = TrajectoryHash(end.seed, end.episode)
+    cut = bool(end.truncated)
+    for step in range(steps):
+        digest.observe(joined.truth[step], joined.state[step])
+        last = step == steps - 1 and not cut
+        flags = (bool(end.terminated), False, bool(end.success)) if last else (False,) * 3
+        digest.act(joined.executed[step], float(joined.reward[step]), *flags)
+    if cut:
+        digest.observe(joined.truth[steps], joined.state[steps])
+    if digest.hexdigest() != end.trajectory_hash:
+        raise ContradictionError(
+            f"its data do not give its trajectory hash {end.trajectory_hash[:12]}..."
+        )
+
+
+def _faults(joined: Joined, robots: tuple[str, ...]) -> npt.NDArray[np.uint8]:
+    """(T, n) fault codes of the robot-steps that the sim marks as crashed."""
+    codes = joined.codes.copy()
+    for (step, robot), mode in joined.modes.items():
+        code = mode_code(mode)
+        if codes[step, robot] == 0:
+            codes[step, robot] = code
+        elif codes[step, robot] != code:
+            raise ContradictionError(
+                f"{robots[robot]}, step {step}: fault code {codes[step, robot]} in the command, "
+                f"{code} ({mode}) in the EFFECT"
+            )
+    unnamed = np.argwhere(joined.crashed & (codes == 0))
+    if len(unnamed):
+        step, robot = (int(value) for value in unnamed[0])
+        raise IncompleteError(f"no EFFECT event of {robots[robot]}'s step {step}, which crashed")
+    codes[~joined.crashed] = 0
+    return codes
+
+
+def _plan(message: Any, robots: tuple[str, ...]) -> CrashPlan:
+    """A CrashPlan message as the coach's type."""
+    return CrashPlan(
+        episode=int(message.episode),
+        revision=int(message.revision),
+        seed=int(message.seed),
+        rate=float(message.rate),
+        cap=int(message.cap),
+        faults=tuple(_fault(fault, robots) for fault in message.faults),
+    )
+
+
+def _fault(message: Any, robots: tuple[str, ...]) -> Fault:
+    if message.robot not in robots:
+        raise ContradictionError(f"its plan faults {message.robot!r}, who is not one of the team")
+    names, values = message.parameter_names, message.parameter_values
+    return Fault(
+        robot=robots.index(message.robot),
+        mode=str(message.mode),
+        start_step=int(message.start_step),
+        duration_steps=int(message.duration_steps),
+        parameters=tuple(zip(names, map(float, values), strict=True)),
+        trigger=Trigger(TriggerKind(message.trigger), tuple(map(float, message.trigger_values))),
+        entry=int(message.entry),
+    )
