@@ -16,7 +16,7 @@ from pydantic.fields import FieldInfo
 from crash_coach_pkg.config import FURTHEST_M, HIGHEST_RETURN, CoachConfig, TeamSpec
 from crash_coach_pkg.control import ControlSettings
 from crash_coach_pkg.draws import check_team
-from crash_coach_pkg.faults import check_parameters, fault_mode, mode_names
+from crash_coach_pkg.faults import SYNONYMS, check_parameters, fault_mode, mode_names
 from crash_coach_pkg.strategies import ADAPTIVE_ALPHA_MAX, CURRICULUM_ALPHA_MAX
 from sim_pkg.contract import UserError
 
@@ -207,7 +207,8 @@ def _mode_parameters(values: Mapping[str, Value]) -> dict[str, float]:
             by_mode[mode][parameter] = _number(values[name])
     for mode, parameters in by_mode.items():
         check_parameters(mode, parameters)
-    return by_mode[fault_mode(str(values["crash_mode"])).name]
+    chosen = str(values["crash_mode"])
+    return by_mode.get(SYNONYMS.get(chosen, chosen), {})  # an unknown one is CoachConfig's to name
 
 
 def _point(values: Mapping[str, Value]) -> tuple[float, ...]:

@@ -12,7 +12,7 @@ from coach_graph import ROBOTS, Graph, Team, graph, operator, process, run_to_en
 from crash_coach_interfaces.msg import CrashPlan, FaultEvent
 
 from crash_coach_pkg.coach import Coach
-from crash_coach_pkg.config import CoachConfig
+from crash_coach_pkg.config import CoachConfig, TeamSpec
 from crash_coach_pkg.parameters import parameter_specs
 
 
@@ -32,7 +32,7 @@ def victims(plan: CrashPlan) -> list[str]:
 
 def test_plans_equal_the_cores_and_heartbeats_repeat_them(ros_env: dict[str, str]) -> None:
     settings = {"strategy": "fixed", "crash_rate": 0.5, "cap_rule": "authors"}
-    core = Coach(CoachConfig(**settings), ROBOTS, seed=11)
+    core = Coach(CoachConfig(**settings), TeamSpec(ROBOTS), seed=11)
     with process(ros_env, "coach", robots=ROBOTS, seed=11, **settings), team(ros_env) as t:
         t.meet(gate=False)
         for episode in range(12):

@@ -64,6 +64,7 @@ class CoachLink(Node):
         self._due_s = 0.0
         self._started_s = time.monotonic()
         self._settled = False  # whether it is known what a coach before this one left in force
+        self._told = False  # whether the gate has told it
         self._left: CrashPlan | None = None
         self._waiting: list[Played] = [] if follow_sim else [ENDLESS]
         self._plans = self.create_publisher(CrashPlanMessage, "/coach/plan", PLAN)
@@ -114,9 +115,10 @@ class CoachLink(Node):
     def _may_settle(self) -> bool:
         if not self._waiting:
             return False
-        waited_s = time.monotonic() - self._started_s
+        if self._told:
+            return True
         gate = self.count_publishers(IN_FORCE) > 0
-        return waited_s >= (ADOPT_TIMEOUT_S if gate else DISCOVERY_S) or self._left is not None
+        return time.monotonic() - self._started_s >= (ADOPT_TIMEOUT_S if gate else DISCOVERY_S)
 
     def _follow(self, played: Played) -> None:
         self.publish(self.control.follow(played.episode))
@@ -141,11 +143,17 @@ class CoachLink(Node):
         with self.changed:
             if self._settled:
                 return
-            try:
-                self._left = plan_from_message(message, self._robots)
-            except ValueError as error:
-                self.get_logger().error(f"plan in force {message.revision}: {error}; ignored")
+            self._told = True
+            if message.revision:  # otherwise there never was a plan
+                self._left = self._read(message)
             self.settle(at_once=False)
+
+    def _read(self, message: CrashPlanMessage) -> CrashPlan | None:
+        try:
+            return plan_from_message(message, self._robots)
+        except UserError as error:
+            self.get_logger().error(f"plan in force {message.revision}: {error}; ignored")
+            return None
 
     def _on_event(self, message: FaultEvent) -> None:
         with self.changed:

@@ -151,6 +151,7 @@ class GateBase(Node):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(TICK_S, lambda: gate.tick(time.monotonic()), clock=steady)
         self.create_timer(DIAGNOSTICS_S, lambda: self._on_diagnostics(gate), clock=steady)
+        self._tell_plan()  # a coach that starts need not wait for what is in force
 
     def send_events(self, events: Iterable[Event]) -> None:
         """To /coach/events; a plan that they change to /coach/plan_in_force."""
