@@ -69,11 +69,14 @@ def check_target(out: Path) -> None:
     """
     if not out.absolute().parent.is_dir():
         raise CliError(f"--out {out}: there is no folder {out.absolute().parent}")
-    if not out.exists():
+    if not os.path.exists(out):
         return
-    if not out.is_dir():
-        raise CliError(f"--out {out}: is not a folder")
-    foreign = sorted({entry.name for entry in out.iterdir()} - FILES)
+    try:
+        foreign = sorted(set(os.listdir(out)) - FILES)
+    except NotADirectoryError:
+        raise CliError(f"--out {out}: is not a folder") from None
+    except OSError as error:
+        raise CliError(f"--out {out}: cannot be read: {error.strerror}") from None
     if foreign:
         raise CliError(f"--out {out}: holds {foreign[0]!r}, which no report has; name a new folder")
 
@@ -94,7 +97,9 @@ def write(out: Path, played: Played, run: FaultRun) -> None:
         EVENTS: events(run),
         RESULT: json.dumps(result(played, run), indent=2) + "\n",
     }
-    content = {name: text.encode() for name, text in texts.items()} | figures(run)
+    # Names of files need not be UTF-8.
+    encoded = {name: text.encode(errors="replace") for name, text in texts.items()}
+    content = encoded | figures(run)
     _replace(out, content)
 
 
@@ -102,21 +107,22 @@ def _replace(out: Path, content: Mapping[str, bytes]) -> None:
     out = out.absolute()
     new = out.with_name(f".{out.name}.{os.getpid()}.partial")
     old = out.with_name(f".{out.name}.{os.getpid()}.old")
+    moved = False
     try:
         new.mkdir()
         for name, data in content.items():
             (new / name).write_bytes(data)
         if out.exists():
             out.rename(old)
+            moved = True
         new.rename(out)
     except OSError as error:
-        if old.exists() and not out.exists():
+        if moved:
             old.rename(out)
         raise CliError(f"--out {out}: cannot be written: {error.strerror}") from None
     finally:
-        for rest in (new, old):
-            if rest.exists():
-                shutil.rmtree(rest)
+        shutil.rmtree(new, ignore_errors=True)
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def events(run: FaultRun) -> str:

@@ -1,0 +1,75 @@
+"""docs/faults.md against the schemas, and its command lines against the coach's parameters."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from crash_coach_bringup.cli.faults_docs import BLOCK, SET_LINES, generated, update
+from crash_coach_bringup.cli.output import CliError
+from crash_coach_pkg.config import FaultConfig, TeamSpec
+from crash_coach_pkg.expectations import Expectation
+from crash_coach_pkg.fault_scenario import load_fault_scenario
+from crash_coach_pkg.faults import fault_mode, mode_names
+from crash_coach_pkg.parameters import build_settings, parameter_specs
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "faults.md"
+TEAM = TeamSpec(("robot_1", "robot_2"), ("robot", "robot"), 0.5)
+LINES = re.findall(r"ros2 param set (\S+) (\S+) ([^`\n]+)", PAGE.read_text())
+
+
+def test_the_page_is_what_the_schemas_say() -> None:
+    page = PAGE.read_text()
+    assert update(page) == page, "run: crash-coach faults docs --page docs/faults.md"
+
+
+def test_an_outdated_page_is_mended_and_a_broken_one_refused() -> None:
+    page = PAGE.read_text()
+    old = BLOCK.sub(lambda m: f"{m.group(1)}old\n{m.group(3)}", page)
+    assert old != page
+    assert update(old) == page
+    with pytest.raises(CliError, match="once each: modes, settings, file, expectations"):
+        update(page.replace("<!-- generated: modes -->", ""))
+
+
+def test_every_mode_parameter_setting_and_expectation_is_there() -> None:
+    blocks = generated()
+    for mode in mode_names():
+        assert f"### `{mode}`" in blocks["modes"]
+        assert any(name == "crash_mode" and value == mode for _, name, value in LINES)
+        for parameter in fault_mode(mode).Parameters.model_fields:
+            assert any(name == f"{mode}.{parameter}" for _, name, _ in LINES)
+    for name in FaultConfig.model_fields:
+        assert f"| `{name}` |" in blocks["settings"]
+    assert set(FaultConfig.model_fields) - set(SET_LINES) == {"crash_parameters"}
+    for name in Expectation.model_fields:
+        assert f"| `{name}` |" in blocks["expectations"]
+
+
+@pytest.mark.parametrize(("node", "name", "typed"), LINES)
+def test_each_command_line_sets_a_parameter_within_its_range(
+    node: str, name: str, typed: str
+) -> None:
+    assert node == "/coach"
+    (spec,) = (spec for spec in parameter_specs() if spec.name == name)
+    value = yaml.safe_load(typed.strip('"'))  # as `ros2 param set` reads it
+    kind = type(spec.default)
+    if kind is tuple:
+        value = tuple(value)
+    assert type(value) is kind, f"{name}: {value!r} is no {kind.__name__}"
+    if spec.low is not None and spec.high is not None:
+        assert spec.low <= value <= spec.high
+    values = {s.name: s.default for s in parameter_specs()}
+    build_settings({**values, name: value}, TEAM)
+
+
+def test_the_example_is_a_fault_scenario_that_fits(tmp_path: Path) -> None:
+    (text,) = re.findall(r"```yaml\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
+    path = tmp_path / "example.yaml"
+    path.write_text(text)
+    scenario = load_fault_scenario(path)
+    assert scenario.expect
+    scenario.check(TeamSpec(("robot_1", "robot_2", "robot_3", "robot_4"), (), 0.5), 80)
