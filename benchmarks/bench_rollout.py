@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from crash_coach_pkg.coach import Coach
-from crash_coach_pkg.config import CoachConfig
+from crash_coach_pkg.config import CoachConfig, TeamSpec
 from policy_pkg.policy import RecurrentPolicy
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.episode import Sizes
@@ -56,7 +56,7 @@ def rollout_rate(scenario: str, arenas: int, calls: int) -> float:
     weights = Learner(LearnerConfig.model_validate({}), sizes, seed=0).agent_weights()
     policy = RecurrentPolicy(weights, spec.n_robots, spec.n_actions)
     crash = CoachConfig.model_validate({"strategy": "fixed", "crash_rate": CRASH_RATE})
-    coach = Coach(crash, spec.robots, seed=0)
+    coach = Coach(crash, TeamSpec.of(spec), seed=0)
     rollout = Rollout(env, policy, coach.plan, 0, np.random.default_rng(0))
     replay = Replay(500, sizes)
 

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from crash_coach_pkg.coach import Coach
-from crash_coach_pkg.config import CoachConfig
-from crash_coach_pkg.plan import Mode
+from crash_coach_pkg.config import CoachConfig, TeamSpec
+from crash_coach_pkg.plan import CrashPlan, Fault, Trigger, TriggerKind
 from policy_pkg.checkpoint import CheckpointError
 from policy_pkg.policy import RecurrentPolicy
 from policy_pkg.train.episode import Sizes
@@ -32,8 +34,21 @@ def make_rollout(arenas: int, crash: CoachConfig = RANDOM, scenario: str = "butt
     spec = env.spec
     weights = Learner(LearnerConfig(), Sizes.of(spec), seed=1).agent_weights()
     policy = RecurrentPolicy(weights, spec.n_robots, spec.n_actions)
-    coach = Coach(crash, spec.robots, SEED)
+    coach = Coach(crash, TeamSpec.of(spec), SEED)
     return Rollout(env, policy, coach.plan, SEED, np.random.default_rng(2))
+
+
+CODES = {"mute": 1, "random": 2}
+
+
+def codes_at(plan: CrashPlan, step: int, n_robots: int) -> npt.NDArray[np.uint8]:
+    """(n,) what a plan without triggers says of one step."""
+    codes = np.zeros(n_robots, dtype=np.uint8)
+    for fault in plan.faults:
+        end = fault.start_step + fault.duration_steps if fault.duration_steps else math.inf
+        if fault.start_step <= step < end:
+            codes[fault.robot] = CODES[fault.mode]
+    return codes
 
 
 def copied(finished: Finished) -> Finished:
@@ -63,10 +78,10 @@ def test_episodes_hold_what_the_environment_did(crash: CoachConfig) -> None:
             np.testing.assert_array_equal(episode.obs[t], env.obs[0])
             np.testing.assert_array_equal(episode.state[t], env.state[0])
             np.testing.assert_array_equal(episode.available[t], env.available[0])
-            modes = finished.plan.modes_at(t, sizes.n_robots)
+            modes = codes_at(finished.plan, t, sizes.n_robots)
             np.testing.assert_array_equal(episode.faults[t], modes)
-            assert (episode.actions[t][modes == Mode.MUTE] == stay).all()
-            faulted += int((modes != Mode.NONE).sum())
+            assert (episode.actions[t][modes == CODES["mute"]] == stay).all()
+            faulted += int((modes != 0).sum())
             result = env.step(episode.actions[t : t + 1])
             assert episode.reward[t] == np.float32(result.reward[0])
             assert bool(result.terminated[0]) == (t == episode.length - 1)
