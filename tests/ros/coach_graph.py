@@ -154,8 +154,11 @@ class Team:
         while time.monotonic() < end:
             self.executor.spin_once(timeout_sec=0.02)
 
-    def meet(self, gate: bool = True, coach: bool = True) -> None:
-        """Waits until the processes under test have found this node, and it them."""
+    def meet(self, gate: bool = True, coach: bool = True, follows: bool = True) -> None:
+        """Waits until the processes under test have found this node, and it them.
+
+        ``follows``: the coach follows /sim.
+        """
         n = self.node
 
         def met() -> bool:
@@ -170,7 +173,7 @@ class Team:
                     and n.count_publishers("/coach/events") > 0
                 )
             if coach:
-                ready = ready and n.count_subscribers("/sim/boundary") > 0
+                ready = ready and (not follows or n.count_subscribers("/sim/boundary") > 0)
                 ready = ready and n.count_publishers("/coach/plan") > 0
             return ready
 
@@ -257,6 +260,6 @@ def graph(env: dict[str, str], lockstep: bool = True, **coach: object) -> Iterat
         gate_process = stack.enter_context(process(env, "gate", robots=ROBOTS, lockstep=lockstep))
         coach_process = stack.enter_context(process(env, "coach", robots=ROBOTS, **coach))
         played = stack.enter_context(team(env))
-        played.meet()
+        played.meet(follows=bool(coach.get("follow_sim", True)))
         setter = stack.enter_context(operator(env))
         yield Graph(env, played, setter, gate_process, coach_process)

@@ -13,7 +13,7 @@ from crash_coach_interfaces.msg import CrashPlan, FaultEvent
 
 from crash_coach_pkg.coach import Coach
 from crash_coach_pkg.config import CoachConfig, TeamSpec
-from crash_coach_pkg.parameters import parameter_specs
+from crash_coach_pkg.parameters import START_SPECS, parameter_specs
 
 
 def new_plan(team: Team, wanted: Callable[[CrashPlan], bool], what: str) -> CrashPlan:
@@ -48,11 +48,14 @@ def test_plans_equal_the_cores_and_heartbeats_repeat_them(ros_env: dict[str, str
 
 
 def test_every_parameter_is_described(ros_env: dict[str, str]) -> None:
-    names = [spec.name for spec in parameter_specs()]
+    names = [spec.name for spec in (*parameter_specs(), *START_SPECS)]
     with process(ros_env, "coach", robots=ROBOTS), operator(ros_env) as setter:
         described = {d.name: d for d in setter.describe([*names, "robots"])}
         assert all(d.description for d in described.values())
         assert described["robots"].read_only
+        assert all(described[spec.name].read_only for spec in START_SPECS)
+        assert described["delay.steps"].integer_range[0].to_value == 1000
+        assert "[m/s]" in described["bias.linear_x_m_s"].description
         assert described["crash_rate"].floating_point_range[0].to_value == 1.0
         assert described["lease_s"].floating_point_range[0].from_value == pytest.approx(0.2)
         assert described["crashed_exactly"].integer_range[0].from_value == -1
@@ -71,6 +74,14 @@ BAD_SETS: list[tuple[dict[str, object], str]] = [
     ({"crash_rate": 0.4, "crash_mode": "explode"}, "crash_mode 'explode'"),
     ({"crash_rate": 0.4, "strategy": "wild"}, "unknown coaching strategy 'wild'"),
     ({"crash_rate": 0.4, "rho": 0.0}, "rho 0.0"),
+    ({"victim_role": "scout"}, "'scout'; one of: this team has no roles"),
+    ({"hazard_rate_hz": 0.5}, "dt_s is unknown"),
+    ({"near_point_m": [1.0]}, "near_point_m [1.0]: x and y in metres"),
+    ({"near_radius_m": -1.0}, "out of range"),
+    ({"near_radius_m": 1.0, "return_above": 2.0}, "near_radius_m 1.0 and return_above 2.0"),
+    ({"delay.steps": 0}, "out of range"),
+    ({"noise.stddev": math.nan}, "noise.stddev out of range"),
+    ({"fault_scenario": "one_mute"}, "read-only"),
     ({"apply_at": "at once"}, "apply_at 'at once'"),
     ({"lease_s": 0.0}, "out of range"),
     ({"seed": -1}, "out of range"),
