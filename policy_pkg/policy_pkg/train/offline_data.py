@@ -21,16 +21,17 @@ from sim_pkg.contract import EnvSpec, UserError
 
 Array = npt.NDArray[Any]
 MIB = 2**20
-_STEP_ARRAYS = ("actions", "reward", "faults")  # the others have an entry T as well
 
 
 class Recorded(Protocol):
     """What is needed of a recorded episode; ``bag_dataset.RecordedEpisode`` is one."""
 
     @property
+    def robots(self) -> tuple[str, ...]: ...
+    @property
     def episode(self) -> Episode: ...
     @property
-    def intents(self) -> npt.NDArray[np.int32]: ...  # (T, n) what the policies wanted
+    def intents(self) -> npt.NDArray[np.int32]: ...  # (T, n) what policies wanted; -1: unknown
     @property
     def success(self) -> bool: ...
     @property
@@ -47,6 +48,7 @@ class DataError(UserError):
 class FixedData:
     """N episodes. ``crashed``: (N,) how many robots had a fault in force at some step."""
 
+    robots: tuple[str, ...]
     episodes: Replay
     crashed: npt.NDArray[np.int64]
     success_rate: float
@@ -86,22 +88,23 @@ def load_data(
             itself, or they take more memory than allowed.
     """
     sizes = None if spec is None else Sizes.of(spec)
+    robots = () if spec is None else spec.robots
     name = "the first episode" if spec is None else f"scenario {spec.scenario!r}"
     entries: list[_Entry] = []
     longest = 0
     for one in recorded:
         if sizes is None:
-            sizes = _sizes_of(one.episode)
+            sizes, robots = _sizes_of(one.episode), one.robots
         longest = max(longest, one.episode.length)
         if spec is None:
             sizes = replace(sizes, episode_limit=longest)
-        _check(one, sizes, name)
+        _check(one, robots, sizes, name)
         entries.append(_entry(one))
         _check_bound(sizes, len(entries), memory_limit_mib)
     if sizes is None:
         raise DataError("the recordings hold no complete episode: there is nothing to learn from")
     entries.sort(key=lambda entry: entry.key)
-    return _fixed(deque(entries), sizes)
+    return _fixed(robots, deque(entries), sizes)
 
 
 def _sizes_of(episode: Episode) -> Sizes:
@@ -118,12 +121,14 @@ def _sizes_of(episode: Episode) -> Sizes:
     )
 
 
-def _check(one: Recorded, sizes: Sizes, name: str) -> None:
+def _check(one: Recorded, robots: tuple[str, ...], sizes: Sizes, name: str) -> None:
     """Raises DataError naming the episode, what is wrong with it and what it had to fit."""
     episode, where = one.episode, f"episode {one.number} of seed {one.seed}"
-    robots = episode.obs.shape[1] if episode.obs.ndim == 3 else 0
-    if robots != sizes.n_robots:
-        raise DataError(f"{where} has {robots} robots, {name} has {sizes.n_robots}")
+    if one.robots != robots:
+        raise DataError(
+            f"{where} has {len(one.robots)} robots ({', '.join(one.robots)}), "
+            f"{name} has {len(robots)} ({', '.join(robots)})"
+        )
     try:
         episode.check(sizes)
     except ValueError as error:
@@ -143,18 +148,19 @@ def _check_actions(one: Recorded, where: str) -> None:
     if len(wrong):
         step, robot = wrong[0]
         raise DataError(
-            f"{where}, step {step}, robot_{robot + 1}: executed action "
+            f"{where}, step {step}, {one.robots[robot]}: executed action "
             f"{episode.actions[step, robot]}, which was not available"
         )
     if one.intents.shape != episode.actions.shape:
         raise DataError(
             f"{where}: intents have the shape {one.intents.shape}, actions {episode.actions.shape}"
         )
-    wrong = np.argwhere((one.intents != episode.actions) & (episode.faults == 0))
+    differ = (one.intents != episode.actions) & (one.intents >= 0)
+    wrong = np.argwhere(differ & (episode.faults == 0))
     if len(wrong):
         step, robot = wrong[0]
         raise DataError(
-            f"{where}, step {step}, robot_{robot + 1}: wanted action {one.intents[step, robot]} "
+            f"{where}, step {step}, {one.robots[robot]}: wanted action {one.intents[step, robot]} "
             f"and executed {episode.actions[step, robot]} without a fault"
         )
 
@@ -182,7 +188,7 @@ def _check_bound(sizes: Sizes, count: int, memory_limit_mib: int) -> None:
         )
 
 
-def _fixed(entries: deque[_Entry], sizes: Sizes) -> FixedData:
+def _fixed(robots: tuple[str, ...], entries: deque[_Entry], sizes: Sizes) -> FixedData:
     """Moves the entries into the ring, which frees them one by one."""
     count = len(entries)
     keys = {entry.key for entry in entries}
@@ -193,4 +199,11 @@ def _fixed(entries: deque[_Entry], sizes: Sizes) -> FixedData:
         episode = entries.popleft().episode
         ring.add(episode)
         crashed[index] = np.count_nonzero(episode.faults.any(axis=0))
-    return FixedData(ring, crashed, successes / count, count - len(keys), digest.hexdigest())
+    return FixedData(
+        robots=robots,
+        episodes=ring,
+        crashed=crashed,
+        success_rate=successes / count,
+        duplicates=count - len(keys),
+        sha256=digest.hexdigest(),
+    )

@@ -98,12 +98,6 @@ class OfflineSession:
         return (_Test("crash_free", crash_free()), *crashed)
 
     @property
-    def robots(self) -> tuple[str, ...]:
-        if self._test_env is not None:
-            return self._test_env.spec.robots
-        return tuple(f"robot_{i}" for i in range(1, self.data.sizes.n_robots + 1))
-
-    @property
     def gradient_steps(self) -> int:
         return self.learner.updates
 

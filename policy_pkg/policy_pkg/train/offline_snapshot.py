@@ -28,7 +28,7 @@ def save(out_dir: Path, session: OfflineSession, logged: Logged) -> Path:
     tensors, values = session.state_dict()
     manifest = Manifest(
         scenario=session.config.scenario or UNKNOWN_SCENARIO,
-        robots=session.robots,
+        robots=session.data.robots,
         n_actions=sizes.n_actions,
         obs_size=sizes.obs_size,
         config=session.config.model_dump(mode="json"),
