@@ -1,38 +1,63 @@
-"""Laws of the gate over random plans, commands, duplicates, silences and clears."""
+"""Laws of the gate over random plans of every mode and trigger, duplicates, silences and clears."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from fault_oracle import OBSERVATION_MODES, WITHHELD, Oracle, random_action, world_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crash_coach_pkg.gate import random_available, random_bits
-from crash_coach_pkg.gate_state import (
-    NOTHING_APPLIED,
-    Command,
-    Decision,
-    Event,
-    EventKind,
-    GateState,
-    Outputs,
-)
-from crash_coach_pkg.plan import NEXT_STEP, CrashPlan, Fault, Mode
+from crash_coach_pkg.gate_state import GateState
+from crash_coach_pkg.gate_types import Command, Decision, Outputs, Seen, Sight
+from crash_coach_pkg.plan import NEXT_STEP, CrashPlan, Fault, Trigger, TriggerKind
+from crash_coach_pkg.plan_book import TEAM, Event, EventKind
 
 ROBOTS = 3
 SEED = 99
 LEASE_S = 1.0
 AVAILABLE = np.array([True, True, False, True])
+ACTIONS = (0, 1, 3, 2)  # 2 is not available: nothing may make a fault pass it on
+WORST = 3
 Key = tuple[int, int, int]
 
+triggers = st.one_of(
+    st.just(Trigger()),
+    st.builds(Trigger, st.just(TriggerKind.HAZARD), st.tuples(st.sampled_from([0.1, 0.5, 1.0]))),
+    st.builds(
+        Trigger,
+        st.just(TriggerKind.NEAR),
+        st.tuples(st.sampled_from([0.0, 3.0]), st.just(0.0), st.sampled_from([1.0, 3.5])),
+    ),
+    st.builds(Trigger, st.just(TriggerKind.RETURN_ABOVE), st.tuples(st.floats(-1, 4))),
+)
+modes = st.sampled_from(
+    [
+        ("mute", ()),
+        ("random", ()),
+        ("freeze", ()),
+        ("delay", (("steps", 1.0),)),
+        ("delay", (("steps", 2.0),)),
+        ("drop", (("probability", 0.5), ("to_bad", 0.3))),
+        ("adversarial", ()),
+        ("blind", ()),
+        ("stale", ()),
+        ("noise", (("stddev", 0.5),)),
+    ]
+)
 faults = st.builds(
-    Fault,
-    robot=st.integers(0, ROBOTS - 1),
-    mode=st.sampled_from([Mode.MUTE, Mode.RANDOM]),
-    start_step=st.one_of(st.just(NEXT_STEP), st.integers(0, 6)),
-    duration_steps=st.integers(0, 4),
+    lambda robot, mode, start, duration, trigger, entry: Fault(
+        robot, mode[0], start, duration, mode[1], trigger, entry
+    ),
+    st.integers(0, ROBOTS - 1),
+    modes,
+    st.one_of(st.just(NEXT_STEP), st.integers(0, 6)),
+    st.integers(0, 4),
+    triggers,
+    st.integers(0, 3),
 )
 operations = st.lists(
     st.one_of(
@@ -43,6 +68,7 @@ operations = st.lists(
         st.tuples(st.just("episode"), st.booleans()),
         st.tuples(st.just("silence"), st.floats(0.0, 0.7)),
         st.tuples(st.just("beat"), st.none()),
+        st.tuples(st.just("repeat"), st.none()),  # a new revision that says the same
         st.tuples(st.just("clear"), st.none()),  # a plan without faults
     ),
     max_size=40,
@@ -54,6 +80,7 @@ class Run:
     """Plays coach, sim and policies against a gate and keeps what the gate says."""
 
     lockstep: bool
+    relays: bool
     gate: GateState = field(init=False)
     now_s: float = 0.0
     episode: int = 0
@@ -61,29 +88,85 @@ class Run:
     sent: CrashPlan | None = None
     steps: list[int] = field(default_factory=lambda: [0] * ROBOTS)
     decided: dict[Key, Decision] = field(default_factory=dict)
-    governs: list[tuple[int, int, CrashPlan | None]] = field(default_factory=list)
+    seen: dict[Key, Seen] = field(default_factory=dict)
+    governs: list[Oracle | None] = field(default_factory=list)  # None: nothing does any more
     asked: set[Key] = field(default_factory=set)
+    running: dict[int, list[tuple[int, int, str, int]]] = field(
+        default_factory=lambda: defaultdict(list)
+    )  # by robot: (episode, first step, mode, entry) of ACTIVE without its end
+    observed: set[Key] = field(default_factory=set)
+    cleared: tuple[int, int] = (0, 0)  # (episode, step) from which the team was told of a clear
 
     def __post_init__(self) -> None:
-        self.gate = GateState(ROBOTS, self.lockstep, first_lease_s=LEASE_S)
+        self.gate = GateState(ROBOTS, self.lockstep, LEASE_S, self.relays)
+
+    # --- what the gate says -----------------------------------------------------------------
 
     def take(self, outputs: Outputs) -> None:
         for output in outputs:
-            if isinstance(output, Event):
-                self.event(output)
-            else:
+            if isinstance(output, Decision):
                 self.decision(output)
+            elif isinstance(output, Seen):
+                self.sight(output)
+            elif output.robot == TEAM:
+                self.team_event(output)
+            else:
+                self.robot_event(output)
 
-    def event(self, event: Event) -> None:
-        here = [step for episode, step, _ in self.decided if episode == event.episode]
+    def team_event(self, event: Event) -> None:
+        keys = [*self.decided, *self.seen]
+        here = [step for episode, step, _ in keys if episode == event.episode]
         assert event.step == max(here, default=-1) + 1
         if event.kind == EventKind.ARMED:
             assert self.sent is not None
             assert (event.episode, event.revision) == (self.sent.episode, self.sent.revision)
-            self.governs.append((event.episode, event.step, self.sent))
+            if not self.continues(self.sent):
+                self.governs.append(Oracle(self.sent, event.step, ROBOTS))
         elif event.kind == EventKind.EXPIRED:
             # At once: also what was held under an older plan.
-            self.governs.append((event.episode, 0, None))
+            self.governs.append(None)
+            self.running.clear()
+        elif event.kind == EventKind.CLEARED:
+            self.cleared = (event.episode, event.step)
+
+    def continues(self, plan: CrashPlan) -> bool:
+        """Whether the plan in force says the same, with its start steps resolved."""
+        before = self.governs[-1] if self.governs else None
+        if before is None or before.plan.episode != plan.episode:
+            return False
+        return before.plan.resolved(before.first).faults == plan.faults
+
+    def robot_event(self, event: Event) -> None:
+        if event.kind == EventKind.EFFECT:
+            assert event.applied == -2
+            self.observed.add((event.episode, event.step, event.robot))
+            return
+        assert event.kind in (EventKind.ACTIVE, EventKind.CLEARED)
+        running = self.running[event.robot]
+        if event.kind == EventKind.ACTIVE:
+            running.append((event.episode, event.step, event.mode, event.entry))
+            return
+        # The team may have been told before that it ends here.
+        ended = [r for r in running if (r[0], *r[2:]) == (event.episode, event.mode, event.entry)]
+        assert ended, "cleared without having been active"
+        running.remove(ended[0])
+
+    def still_running(self, robot: int, now: tuple[int, int]) -> list[tuple[int, int, str, int]]:
+        """What the events say is in force on the robot."""
+        of_episode = [r for r in self.running[robot] if r[0] == now[0]]
+        if self.cleared <= now:
+            of_episode = [r for r in of_episode if r[:2] >= self.cleared]
+        self.running[robot] = of_episode
+        return of_episode
+
+    def oracle(self, key: Key) -> Oracle | None:
+        """The newest plan that governs the step."""
+        for oracle in reversed(self.governs):
+            if oracle is None:
+                return None
+            if oracle.plan.episode == key[0] and oracle.first <= key[1]:
+                return oracle
+        return None
 
     def decision(self, decision: Decision) -> None:
         command = decision.command
@@ -94,53 +177,113 @@ class Run:
         assert key not in self.decided, "decided twice"
         assert key in self.asked
         self.decided[key] = decision
-        mode, seed = self.expected(*key)
-        assert decision.mode == mode
-        if mode == Mode.NONE:
+        running = self.still_running(key[2], key[:2])
+        oracle = self.oracle(key)
+        found = None if oracle is None else oracle.in_force(key[2], key[1], observation=False)
+        if oracle is None or found is None:
+            of_sight = None if oracle is None else oracle.in_force(key[2], key[1], observation=True)
             assert decision.applied == command.action
-        elif mode == Mode.MUTE:
-            assert decision.applied == NOTHING_APPLIED
-        else:
-            bits = random_bits(seed, *key)
-            assert decision.applied == random_available(bits, AVAILABLE[None, :])[0]
+            assert decision.mode == ("" if of_sight is None else of_sight[0].mode)
+            assert decision.observation == (of_sight is not None)
+            assert not [r for r in running if r[2] not in OBSERVATION_MODES]
+            return
+        fault, since = found
+        assert (decision.mode, decision.entry) == (fault.mode, fault.entry)
+        assert not decision.observation
+        assert (fault.mode, fault.entry) in [r[2:] for r in running]
+        assert decision.applied in self.right(oracle, fault, since, key, command.action)
 
-    def expected(self, episode: int, step: int, robot: int) -> tuple[Mode, int]:
-        """By the newest plan that governs the step; worked out apart from the gate's code."""
-        for of, first, plan in reversed(self.governs):
-            if plan is None:
-                return Mode.NONE, SEED
-            if of != episode or step < first:
-                continue
-            mode = Mode.NONE
-            for fault in plan.faults:
-                start = first if fault.start_step == NEXT_STEP else fault.start_step
-                end = start + fault.duration_steps if fault.duration_steps else step + 1
-                if fault.robot == robot and start <= step < end:
-                    mode = fault.mode
-            return mode, plan.seed
-        return Mode.NONE, SEED
+    def right(
+        self, oracle: Oracle, fault: Fault, since: int, key: Key, action: int
+    ) -> tuple[int, ...]:
+        """What may be passed on."""
+        match fault.mode:
+            case "mute":
+                return (WITHHELD,)
+            case "random":
+                return (random_action(SEED, key, AVAILABLE),)
+            case "adversarial":
+                return (WORST,)
+            case "drop":
+                return (WITHHELD, action)
+            case "delay":
+                # Another plan with a delay may have begun anew in between, with nothing under way.
+                begun = max(since, oracle.first)
+                old = key[1] - int(fault.parameters[0][1])
+                sent = ACTIONS[(old + key[2]) % 4]
+                return (sent if old >= begun and AVAILABLE[sent] else WITHHELD,)
+        frozen = [
+            d.applied
+            for k, d in self.decided.items()
+            if k[0] == key[0] and k[2] == key[2] and k[1] < max(since, oracle.first)
+        ]
+        passed = [a for a in frozen if a != WITHHELD]
+        return (passed[-1] if passed and AVAILABLE[passed[-1]] else WITHHELD,)
 
-    def plan(self, new: list[Fault]) -> None:
+    def sight(self, seen: Seen) -> None:
+        key = (*seen.sight.key, seen.sight.robot)
+        if key in self.seen:
+            assert seen is self.seen[key]
+            return
+        self.seen[key] = seen
+        oracle = self.oracle(key)
+        found = None if oracle is None else oracle.in_force(key[2], key[1], observation=True)
+        assert (key in self.observed) == (found is not None)
+        if found is None:
+            assert seen.features is None
+            return
+        assert seen.features is not None
+        assert seen.features is not seen.sight.features
+        if found[0].mode == "blind":
+            assert not seen.features.any()
+
+    # --- what the others do -----------------------------------------------------------------
+
+    def plan(self, new: tuple[Fault, ...]) -> None:
         self.revision += 1
-        self.sent = CrashPlan(self.episode, self.revision, SEED, 0.5, ROBOTS, tuple(new))
+        if not self.relays:
+            new = tuple(f for f in new if f.mode not in OBSERVATION_MODES)
+        self.sent = CrashPlan(self.episode, self.revision, SEED, 0.5, ROBOTS, new)
         self.beat()
+
+    def repeat(self) -> None:
+        """As a coach that came back would: it takes the faults from the plan in force."""
+        if self.sent is not None and self.sent.episode == self.episode:
+            self.plan(self.gate.book.in_force.faults)
 
     def beat(self) -> None:
         if self.sent is not None:
             self.take(self.gate.plan(self.sent, LEASE_S, self.now_s))
 
+    def observe(self, robot: int) -> None:
+        step = self.steps[robot]
+        features = np.array([1.0, step, robot], dtype=np.float32)
+        sight = Sight(robot, self.episode, step, features, AVAILABLE)
+        self.take(self.gate.observation(sight, self.now_s))
+
+    def world(self, step: int) -> None:
+        world = world_of(self.episode, step, ROBOTS)
+        self.take(self.gate.world(self.episode, step, world, self.now_s))
+
     def command(self, robot: int) -> None:
-        """The policy's answer; in lock-step the gate sees it before its observation."""
+        """The policy's answer; in lock-step the gate may see it before what it looks at."""
         key = (self.episode, self.steps[robot])
-        self.asked.add((*key, robot))
-        action = int(np.flatnonzero(AVAILABLE)[(key[1] + robot) % 3])
+        action = ACTIONS[(key[1] + robot) % 4]
         if not self.lockstep:
-            self.take(self.gate.observation(robot, *key, AVAILABLE, self.now_s))
-        self.take(self.gate.command(Command(robot, *key, action), self.now_s))
-        self.take(self.gate.observation(robot, *key, AVAILABLE, self.now_s))
+            self.world(key[1])
+        if self.relays or not self.lockstep:
+            self.observe(robot)
+            if self.relays and (*key, robot) not in self.seen:
+                self.world(key[1])
+            if self.relays and (*key, robot) not in self.seen:
+                return  # the policy has nothing to answer yet
+        self.asked.add((*key, robot))
+        self.take(self.gate.command(Command(robot, *key, action, WORST), self.now_s))
+        self.world(key[1])
+        self.observe(robot)
 
     def answer(self, robot: int) -> None:
-        """In lock-step a robot never runs ahead of the slowest."""
+        """A robot never runs ahead of the slowest."""
         if self.steps[robot] > min(self.steps):
             return
         self.command(robot)
@@ -154,7 +297,7 @@ class Run:
     def play(self, operation: str, argument: object) -> None:
         match operation, argument:
             case "plan", list():
-                self.plan(argument)
+                self.plan(tuple(argument))
             case "step", list() | tuple():
                 for robot in argument:
                     self.answer(robot)
@@ -168,8 +311,10 @@ class Run:
                 self.silence(argument)
             case "beat", _:
                 self.beat()
+            case "repeat", _:
+                self.repeat()
             case _:
-                self.plan([])
+                self.plan(())
 
     def again(self, robot: int) -> None:
         if self.steps[robot] > 0:
@@ -181,11 +326,11 @@ class Run:
             self.episode += 1
             self.steps = [0] * ROBOTS
             if planned:
-                self.plan([])
+                self.plan(())
 
 
-def check(lockstep: bool, played: list[tuple[str, object]], by_lease: bool) -> None:
-    run = Run(lockstep)
+def check(lockstep: bool, relays: bool, played: list[tuple[str, object]], by_lease: bool) -> None:
+    run = Run(lockstep, relays)
     for operation, argument in played:
         run.play(operation, argument)
     if by_lease:
@@ -195,30 +340,37 @@ def check(lockstep: bool, played: list[tuple[str, object]], by_lease: bool) -> N
         run.silence(LEASE_S)
     else:
         # The step under way may still be under the plan that is cleared, by rule.
-        before, first = len(run.decided), 0
-        run.plan([])
-        first = run.governs[-1][1]
-    last = max(run.steps) + 3
-    for _ in range(ROBOTS * (last + 1)):
+        before = len(run.decided)
+        run.plan(())
+        last = run.governs[-1]
+        assert last is not None
+        first = last.first
+        if run.gate.book.next_step != first:  # the plan before had no faults either
+            first = 0
+    last_step = max(run.steps) + 3
+    for _ in range(ROBOTS * (last_step + 1)):
         run.answer(run.steps.index(min(run.steps)))
-    assert min(run.steps) >= last, "a command was held for ever"
+    assert min(run.steps) >= last_step, "a command was held for ever"
     after = [d for d in list(run.decided.values())[before:] if d.command.step >= first]
     assert len(after) >= 3 * ROBOTS - 1
-    assert all(d.mode == Mode.NONE and d.applied == d.command.action for d in after)
+    assert all(d.mode == "" and d.applied == d.command.action for d in after)
+    sights = [s for k, s in run.seen.items() if k[:2] >= (run.episode, last_step - 2)]
+    assert all(s.features is None for s in sights)
 
 
 @settings(deadline=None, max_examples=150)
-@given(lockstep=st.booleans(), played=operations, by_lease=st.booleans())
+@given(lockstep=st.booleans(), relays=st.booleans(), played=operations, by_lease=st.booleans())
 def test_effects_equal_the_plan_and_a_clear_or_a_lapse_lets_everything_pass(
-    lockstep: bool, played: list[tuple[str, object]], by_lease: bool
+    lockstep: bool, relays: bool, played: list[tuple[str, object]], by_lease: bool
 ) -> None:
-    check(lockstep, played, by_lease)
+    check(lockstep, relays, played, by_lease)
 
 
 @pytest.mark.soak
+@pytest.mark.timeout(1800)
 @settings(deadline=None, max_examples=10_000)
-@given(lockstep=st.booleans(), played=operations, by_lease=st.booleans())
+@given(lockstep=st.booleans(), relays=st.booleans(), played=operations, by_lease=st.booleans())
 def test_ten_thousand_runs(
-    lockstep: bool, played: list[tuple[str, object]], by_lease: bool
+    lockstep: bool, relays: bool, played: list[tuple[str, object]], by_lease: bool
 ) -> None:
-    check(lockstep, played, by_lease)
+    check(lockstep, relays, played, by_lease)
