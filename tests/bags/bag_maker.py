@@ -222,12 +222,13 @@ def write(
     compression: str = "zstd",
     ends: bool = True,
     about: About | None = None,
+    flush_every: int = 200,
 ) -> Path:
     """A recording of the messages. ends: closed properly; otherwise as a kill leaves it."""
     now = count()
     writer = BagWriter(
         folder, team.connections, STORE, about or team.about, lambda: float(next(now)),
-        split, compression, flush_s=200,
+        split, compression, flush_s=flush_every,
     )  # fmt: skip
     index = {c.topic: i for i, c in enumerate(team.connections)}
     for number, one in enumerate(sent):

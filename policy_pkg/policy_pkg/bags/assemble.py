@@ -57,7 +57,8 @@ class Joined:
     intents: IntArray  # (T, n) UNKNOWN where not recorded
     crashed: BoolArray  # (T, n) some fault was in force
     codes: npt.NDArray[np.uint8]  # (T, n) Action.fault of the command, 0 where there is none
-    modes: dict[Key, str]  # names, from the events
+    modes: dict[Key, str]  # names of command faults, from the events
+    observed: dict[Key, str]  # names of observation faults, from the events
     end: Any  # EpisodeState
 
 
@@ -114,7 +115,8 @@ def assemble(
         intents=decided.intents(wanted.intents and not last),
         crashed=crashed,
         codes=codes,
-        modes=decided.modes(),
+        modes=decided.modes(pieces.effects),
+        observed=decided.modes(pieces.observed),
         end=end,
     )
 
@@ -219,6 +221,9 @@ class _Decisions:
             faulted = (key for key, command in self._commands.items() if command.fault)
             missing = (key for key in faulted if key not in effects and key not in observed)
             _refuse_missing("EFFECT event", missing, self._robots)
+        applied = (k for k, e in effects.items() if e.applied >= 0 and k[0] < len(self._executed))
+        missing = (key for key in applied if key not in self._commands)
+        _refuse_missing("command beside an EFFECT", missing, self._robots)
         codes = np.zeros(self._executed.shape, np.uint8)
         for key in self._keys:
             command = self._commands.get(key)
@@ -232,7 +237,7 @@ class _Decisions:
         effect = self._pieces.effects.get(key)
         applied = effect.applied if effect is not None else None
         if command is None:
-            return None if applied is None or applied < 0 else "an EFFECT without its command"
+            return None
         if applied is not None and applied != command.action:
             given = f"action {command.action}"
             return f"a command with {given}, but an EFFECT that applied {applied}"
@@ -269,14 +274,9 @@ class _Decisions:
                 out[key] = command.action
         return out
 
-    def modes(self) -> dict[Key, str]:
-        """Names of the faults in force; a command's fault before an observation's."""
-        return {
-            key: event.mode
-            for events in (self._pieces.observed, self._pieces.effects)
-            for key, event in events.items()
-            if key[0] < len(self._executed)
-        }
+    def modes(self, events: dict[Key, Any]) -> dict[Key, str]:
+        """Names of the faults in force, of the steps that were executed."""
+        return {k: str(event.mode) for k, event in events.items() if k[0] < len(self._executed)}
 
 
 def _refuse_missing(what: str, missing: Iterable[Key], robots: Sequence[str]) -> None:

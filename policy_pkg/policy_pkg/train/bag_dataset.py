@@ -201,7 +201,7 @@ def _recorded(
         intents=joined.intents,
         success=bool(end.success),
         plan=_plan(pieces.plan, robots) if pieces.plan is not None else None,
-        modes=joined.modes,
+        modes={**joined.observed, **joined.modes},
         trajectory_hash=end.trajectory_hash,
     )
 
@@ -230,13 +230,15 @@ def _check_hash(joined: Joined) -> None:
 def _faults(joined: Joined, robots: tuple[str, ...]) -> npt.NDArray[np.uint8]:
     """(T, n) fault codes of the robot-steps that the sim marks as crashed."""
     codes = joined.codes.copy()
-    for (step, robot), mode in joined.modes.items():
-        code = mode_code(mode)
-        if codes[step, robot] == 0:
-            codes[step, robot] = code
-        elif codes[step, robot] != code:
+    for key, mode in {**joined.observed, **joined.modes}.items():
+        code, (step, robot) = mode_code(mode), key
+        if codes[key] == 0:
+            codes[key] = code
+        elif codes[key] != code and key not in joined.modes:
+            raise IncompleteError(f"no EFFECT event of {robots[robot]}'s step {step}")
+        elif codes[key] != code:
             raise ContradictionError(
-                f"{robots[robot]}, step {step}: fault code {codes[step, robot]} in the command, "
+                f"{robots[robot]}, step {step}: fault code {codes[key]} in the command, "
                 f"{code} ({mode}) in the EFFECT"
             )
     unnamed = np.argwhere(joined.crashed & (codes == 0))
