@@ -95,7 +95,7 @@ class Run:
         default_factory=lambda: defaultdict(list)
     )  # by robot: (episode, first step, mode, entry) of ACTIVE without its end
     observed: set[Key] = field(default_factory=set)
-    cleared: tuple[int, int] = (0, 0)  # (episode, step) from which the team was told of a clear
+    clears: list[tuple[int, int]] = field(default_factory=list)  # of the team: (episode, step)
 
     def __post_init__(self) -> None:
         self.gate = GateState(ROBOTS, self.lockstep, LEASE_S, self.relays)
@@ -127,7 +127,7 @@ class Run:
             self.governs.append(None)
             self.running.clear()
         elif event.kind == EventKind.CLEARED:
-            self.cleared = (event.episode, event.step)
+            self.clears.append((event.episode, event.step))
 
     def continues(self, plan: CrashPlan) -> bool:
         """Whether the plan in force says the same, with its start steps resolved."""
@@ -153,11 +153,12 @@ class Run:
 
     def still_running(self, robot: int, now: tuple[int, int]) -> list[tuple[int, int, str, int]]:
         """What the events say is in force on the robot."""
-        of_episode = [r for r in self.running[robot] if r[0] == now[0]]
-        if self.cleared <= now:
-            of_episode = [r for r in of_episode if r[:2] >= self.cleared]
-        self.running[robot] = of_episode
-        return of_episode
+        self.running[robot] = [
+            r
+            for r in self.running[robot]
+            if r[0] == now[0] and not any(r[:2] < clear <= now for clear in self.clears)
+        ]
+        return self.running[robot]
 
     def oracle(self, key: Key) -> Oracle | None:
         """The newest plan that governs the step."""

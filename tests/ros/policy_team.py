@@ -20,6 +20,7 @@ SPEC = EnvSpec(
     episode_limit=20,
     dt_s=0.5,
     bounds=(-1.0, 1.0),
+    roles=("robot",) * ROBOTS,
 )
 ALL = np.ones(ACTIONS, dtype=np.uint8)
 

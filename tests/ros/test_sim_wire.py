@@ -44,7 +44,7 @@ def test_an_observation_holds_what_the_session_says(frame_id: str) -> None:
 
 @pytest.mark.parametrize("frame_id", ["", "m", "ma", "map", "base"])
 def test_a_command_is_read_as_rclpy_writes_it(frame_id: str) -> None:
-    message = Action(episode=2**32 - 1, step=70_000, action=-3, fault=2)
+    message = Action(episode=2**32 - 1, step=70_000, action=-3, worst_action=4, fault=2)
     message.header.frame_id = frame_id
     data = serialize_message(message)
     read = command_from_bytes(data)
