@@ -154,6 +154,16 @@ def check_team(options: UpOptions) -> TeamSpec:
     return TeamSpec.of(spec)
 
 
+def lost_after_s(options: UpOptions, dt_s: float) -> float:
+    """Real time: the age at which sim and gate call a robot's command too old, seconds."""
+    chosen = options.sim.get("cmd_timeout_s")
+    if isinstance(chosen, int | float) and chosen > 0:
+        return float(chosen)
+    factor = options.sim.get("real_time_factor", 1.0)
+    assert isinstance(factor, int | float)  # as the sim's parameter is declared
+    return LOST_STEPS * dt_s / factor
+
+
 def graph_nodes(options: UpOptions, team: TeamSpec) -> list[Node]:
     """The graph's nodes, the sim last: the others are ready to answer when it starts."""
     acting: dict[str, Value] = {
@@ -171,7 +181,7 @@ def graph_nodes(options: UpOptions, team: TeamSpec) -> list[Node]:
             "relay_observations": relays,
         }
         if options.mode == "realtime" and team.dt_s is not None:
-            gate["cmd_timeout_s"] = LOST_STEPS * team.dt_s
+            gate["cmd_timeout_s"] = lost_after_s(options, team.dt_s)
         nodes += [
             Node("gate", "crash_coach_pkg", "gate", gate),
             Node("coach", "crash_coach_pkg", "coach", coach_parameters(options, team)),
