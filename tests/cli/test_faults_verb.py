@@ -147,6 +147,16 @@ def test_a_run_that_passes_writes_everything(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["report"]
 
 
+def test_the_report_names_the_episodes_that_were_lost(tmp_path: Path) -> None:
+    head = "description: d\nfaults: [{victims: [robot_2]}]\n"
+    file, out = file_of(tmp_path, "effects: {}", head), tmp_path / "report"
+    team = ("--policy", "scripted:coverage_fixed", "--scenario", "coverage", "--episodes", "2")
+    assert faults("run", file, *team, "--out", str(out)).exit_code == 0
+    page = (out / "report.md").read_text()
+    assert "## Episodes lost to the faults: 2 of 2\n" in page
+    assert "| 1 | robot_2 | " in page
+
+
 def test_a_second_run_replaces_the_report_with_the_same(tmp_path: Path) -> None:
     file = file_of(tmp_path, "effects: {}")
     out = tmp_path / "report"
@@ -259,7 +269,7 @@ def test_the_installed_command_exits_with_the_verdict(tmp_path: Path) -> None:
     fails = crash_coach("run", file_of(tmp_path, "return_drop: {at_most: -1}"), *QUICK)
     assert (fails.returncode, fails.stderr) == (1, "")
     assert "failed" in fails.stdout
-    wrong = crash_coach("run", file_of(tmp_path, "return_drop: {at_mst: -1}"), *QUICK)
+    wrong = crash_coach("run", *QUICK, file_of(tmp_path, "return_drop: {at_mst: -1}"))
     assert (wrong.returncode, wrong.stdout) == (1, "")
     assert wrong.stderr.startswith("crash-coach: error: ")
     assert "mine.yaml:4: unknown key" in wrong.stderr

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from crash_coach_pkg.fault_scenario import (
     load_fault_scenario,
 )
 from crash_coach_pkg.plan import CrashPlan, TriggerKind
+from crash_coach_pkg.schedule import Schedule
 from sim_pkg.contract import UserError
 
 TEAM = TeamSpec(
@@ -177,6 +179,44 @@ def test_entries_draw_apart(tmp_path: Path) -> None:
     for entry in (0, 1):
         for robot in range(4):
             assert 850 < sum(drawn(plan, entry) == [robot] for plan in plans) < 1150
+
+
+limits = st.fixed_dictionaries(
+    {},
+    optional={
+        "min_alive": st.integers(0, 4),
+        "max_crashed": st.integers(-1, 4),
+        "start_step": st.integers(0, 12),
+        "duration_steps": st.integers(0, 8),
+        "crashed_exactly": st.integers(0, 4),
+        "hazard_rate_hz": st.sampled_from([0.0, 0.3, 3.0]),
+    },
+)
+
+
+@given(entries=st.lists(limits, min_size=1, max_size=4), seed=st.integers(0, 1000))
+@settings(max_examples=200)
+def test_limits_hold_in_every_step_of_every_file_that_is_accepted(
+    entries: list[dict[str, float]], seed: int, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    # JSON is YAML.
+    read = scenario(
+        tmp_path_factory.mktemp("limits"), file_of(*(json.dumps(entry) for entry in entries))
+    )
+    try:
+        read.check(TEAM, LIMIT)
+    except UserError:
+        return
+    plan = ScenarioPlanner(read, TEAM, seed).plan(0)
+    limit = min(
+        min(4 - entry.get("min_alive", 0), 4 if (m := entry.get("max_crashed", -1)) < 0 else m)
+        for entry in entries
+    )
+    followed = Schedule(plan)
+    for step in range(LIMIT):
+        followed.enter(step, None)
+        faulted = {plan.faults[place].robot for place in followed.in_force}
+        assert len(faulted) <= limit, f"step {step}: {faulted}"
 
 
 def test_a_negative_seed_is_refused(tmp_path: Path) -> None:

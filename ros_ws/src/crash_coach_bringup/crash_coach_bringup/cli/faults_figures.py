@@ -9,6 +9,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from crash_coach_bringup.cli.plot import COLOURS, INK
+from crash_coach_pkg.faults import is_observation_mode
 from policy_pkg.train.statistics import wilson
 from policy_pkg.train.verdict import FaultRun
 
@@ -96,7 +97,10 @@ def timeline(run: FaultRun) -> Figure:
         colour = COLOURS[entry % len(COLOURS)]
         lines = [robots.index(row.robot) for row in at]
         left = [row.step for row in at]
-        ax.barh(lines, [1.0] * len(at), 0.6, left, color=colour, label=f"{mode} (entry {entry})")
+        # Thin: an observation and a command may be faulted in the same step.
+        height = 0.25 if is_observation_mode(mode) else 0.6
+        label = f"{mode} (entry {entry})"
+        ax.barh(lines, [1.0] * len(at), height, left, color=colour, label=label)
     ax.set_yticks(range(len(robots)), robots)
     ax.set_ylim(len(robots) - 0.5, -0.5)
     ax.set_xlim(0, max(1, steps))

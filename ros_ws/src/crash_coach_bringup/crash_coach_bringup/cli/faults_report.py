@@ -24,6 +24,7 @@ from policy_pkg.train.verdict import FaultRun, Verdict
 
 REPORT, JUNIT, EVENTS, RESULT = "report.md", "junit.xml", "events.jsonl", "result.json"
 FIGURES = ("success.png", "returns.png", "timeline.png")
+MOST_LOST = 20  # episodes in the table of lost ones
 FILES = frozenset((REPORT, JUNIT, EVENTS, RESULT, *FIGURES))
 _NOT_XML = re.compile("[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -223,9 +224,30 @@ def report(played: Played, run: FaultRun) -> str:
             ((e.entry, e.mode, e.due, e.took_effect, e.robot_steps) for e in run.entries),
         ),
         "![Faults of one episode over time](timeline.png)",
+        *_lost(run),
         f"Effect log: {len(run.faulted.effects)} events, SHA-256 `{events_sha256(run)}`.",
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _lost(run: FaultRun) -> list[str]:
+    """The section on episodes that the faults cost; nothing without one."""
+    lost = [p for p in run.trials.pairs if p.crash_free.success and not p.faulted.success]
+    if not lost:
+        return []
+    shown = lost[:MOST_LOST]
+    rows = [
+        (
+            pair.episode,
+            ", ".join(dict.fromkeys(fault.robot for fault in pair.due)),
+            f"{pair.crash_free.episode_return:.3f} → {pair.faulted.episode_return:.3f}",
+        )
+        for pair in shown
+    ]
+    title = f"## Episodes lost to the faults: {len(lost)} of {len(run.trials.pairs)}"
+    if len(shown) < len(lost):
+        title += f" (the first {len(shown)})"
+    return [title, table(("episode", "robots with faults due", "return"), rows)]
 
 
 def _figures(name: str, evaluation: Evaluation) -> tuple[str, ...]:
