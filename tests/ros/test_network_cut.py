@@ -9,7 +9,6 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,7 @@ def refuse_without_namespaces() -> None:
 
 
 @pytest.fixture(scope="module")
-def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
+def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     refuse_without_namespaces()
     folder = tmp_path_factory.mktemp("network")
     script = str(Path(__file__).with_name("network_cut.py"))
@@ -46,7 +45,8 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
     if done.returncode == NOT_PERMITTED:
         pytest.skip(done.stderr.strip())
     assert done.returncode == 0, done.stderr  # a dead process, or a wait that ended in vain
-    yield json.loads(done.stdout)
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
 
 
 def test_the_robot_behind_the_link_stops_in_time(seen: dict[str, Any]) -> None:
