@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -64,23 +65,29 @@ def success(run: FaultRun) -> Figure:
 
 
 def returns(run: FaultRun) -> Figure:
-    """Each episode's return with the faults over its return without."""
-    figure, ax = _axes(4.6, 4.4)
-    pairs = run.trials.pairs
-    for done, marker in ((True, "o"), (False, "x")):
-        these = [p for p in pairs if p.faulted.success is done]
-        ax.scatter(
-            [p.crash_free.episode_return for p in these],
-            [p.faulted.episode_return for p in these],
-            color=FAULTED,
-            marker=marker,
-            alpha=0.6,
-            label=f"{'success' if done else 'no success'} with the faults ({len(these)})",
+    """Each episode's return with the faults over its return without; areas show equal pairs."""
+    figure, ax = _axes(5, 4.8)
+    for done, colour in ((True, FREE), (False, FAULTED)):
+        points = Counter(
+            (p.crash_free.episode_return, p.faulted.episode_return)
+            for p in run.trials.pairs
+            if p.faulted.success is done
         )
-    ax.axline((pairs[0].crash_free.episode_return,) * 2, slope=1, color=INK, linewidth=0.8)
+        if points:
+            free, faulted = zip(*points, strict=True)
+            label = f"{'success' if done else 'no success'} with the faults ({points.total()})"
+            sizes = [15 + 400 * count / len(run.trials.pairs) for count in points.values()]
+            ax.scatter(free, faulted, sizes, color=colour, alpha=0.6, linewidth=0)
+            ax.scatter([], [], 30, color=colour, label=label)
+    both = [outcome for pair in run.trials.pairs for outcome in (pair.crash_free, pair.faulted)]
+    low, high = (extreme(o.episode_return for o in both) for extreme in (min, max))
+    margin = 0.07 * (high - low) or 1.0
+    span = (low - margin, high + margin)
+    ax.plot(span, span, color=INK, linewidth=0.8, zorder=0)
+    ax.set(xlim=span, ylim=span, aspect="equal")
     ax.set_xlabel("return without the faults", color=INK)
-    ax.set_ylabel("return with the faults", color=INK)
-    ax.legend(frameon=False, fontsize=8)
+    ax.set_ylabel("return with the faults (on the line: they cost nothing)", color=INK)
+    figure.legend(loc="outside upper center", frameon=False, fontsize=8)
     return figure
 
 
