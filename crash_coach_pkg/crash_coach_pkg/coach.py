@@ -91,10 +91,14 @@ class Coach:
         coach._revision = self._revision + 1
         same = config.strategy == self._config.strategy
         if same and coach._rate == self._strategy.initial_rate:
-            coach._rate = self._rate
-            if config.alpha_max is not None:
-                coach._rate = min(self._rate, config.alpha_max)
+            coach._rate = coach._below_ceiling(self._rate)
         return coach
+
+    def _below_ceiling(self, rate: float) -> float:
+        """A rate that was in force before; alpha_max does not concern strategy ``fixed``."""
+        ceiling = self._config.alpha_max
+        constant = self._config.strategy in ("none", "fixed")
+        return rate if constant or ceiling is None else min(rate, ceiling)
 
     @property
     def needs_success(self) -> bool:
@@ -147,9 +151,7 @@ class Coach:
     def resume(self, rate: float, progress: Progress) -> None:
         """Goes on from the ``rate`` that another coach had in force; a strategy that does not
         depend on the rate before (fixed, curriculum) keeps its own."""
-        new = self._strategy.next_rate(rate, None, progress)
-        ceiling = self._config.alpha_max
-        self._set_rate(new if ceiling is None else min(new, ceiling))
+        self._set_rate(self._below_ceiling(self._strategy.next_rate(rate, None, progress)))
 
     def record_block(self, success_rate: float, progress: Progress) -> BlockRecord:
         """Ends an evaluation block with its success rate e_t and moves the rate.

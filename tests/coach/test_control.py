@@ -140,6 +140,9 @@ def test_the_rate_goes_on_through_a_change_of_settings() -> None:
     assert coach.rate == 0.9
     coach.configure(settings(strategy="fixed", crash_rate=0.8), now=False)
     assert coach.rate == 0.8
+    # Found by the parameter fuzz: the same settings once gave another rate than from the start.
+    coach.configure(settings(strategy="fixed", crash_rate=0.8, alpha_max=0.1), now=False)
+    assert coach.rate == 0.8
     coach.configure(settings(strategy="adaptive"), now=False)
     assert coach.rate == 0.0
 

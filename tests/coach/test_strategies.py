@@ -182,7 +182,7 @@ def test_a_role_is_the_whole_of_the_crash_fraction() -> None:
     [
         ({"strategy": "adaptive"}, 0.6),
         ({"strategy": "adaptive", "alpha_max": 0.5}, 0.5),
-        ({"strategy": "fixed", "crash_rate": 0.2}, 0.2),
+        ({"strategy": "fixed", "crash_rate": 0.2, "alpha_max": 0.1}, 0.2),
         ({"strategy": "curriculum", "curriculum_delta": 0.01}, 0.04),
     ],
 )

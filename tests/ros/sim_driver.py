@@ -61,8 +61,8 @@ class Driver:
         self.context = Context()
         rclpy.init(context=self.context)
         self.node = Node("driver", context=self.context)
-        self._executor = SingleThreadedExecutor(context=self.context)
-        self._executor.add_node(self.node)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
         one = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
         self.one, self.ten = one, QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
         latched = QoSProfile(
@@ -84,7 +84,7 @@ class Driver:
         self.node.create_subscription(EpisodeState, "/sim/episode", self.states.append, latched)
 
     def close(self) -> None:
-        self._executor.shutdown()
+        self.executor.shutdown()
         self.node.destroy_node()
         rclpy.shutdown(context=self.context)
 
@@ -112,17 +112,17 @@ class Driver:
             value = what()
             if value:
                 return value
-            self._executor.spin_once(timeout_sec=0.05)
+            self.executor.spin_once(timeout_sec=0.05)
         raise AssertionError(f"not within {timeout_s} s; {len(self.states)} episode states came")
 
     def spin(self, seconds: float) -> None:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            self._executor.spin_once(timeout_sec=0.02)
+            self.executor.spin_once(timeout_sec=0.02)
 
     def call(self, service: str, kind: Any, request: Any) -> Any:
         client = self.node.create_client(kind, service)
-        greet(self.node, "/sim", self._executor.spin_once, WAIT_S, "/sim")
+        greet(self.node, "/sim", self.executor.spin_once, WAIT_S, "/sim")
         self.until(client.service_is_ready)
         future = client.call_async(request)
         self.until(future.done)

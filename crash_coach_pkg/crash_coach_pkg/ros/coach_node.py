@@ -46,6 +46,7 @@ from crash_coach_pkg.parameters import (
     parameter_specs,
 )
 from crash_coach_pkg.ros.coach_link import CoachLink
+from crash_coach_pkg.ros.parameter_service import CheckedParameterService
 from crash_coach_pkg.ros.run import SPIN_S, refuse_unknown_parameters, robot_names, spin
 from sim_pkg.contract import UserError
 
@@ -58,7 +59,8 @@ class CoachNode(Node):
     """
 
     def __init__(self, context: Context | None = None) -> None:
-        super().__init__("coach", context=context)
+        super().__init__("coach", context=context, start_parameter_services=False)
+        self._parameter_services = CheckedParameterService(self)
         robots = robot_names(self)
         self._unconfirmed = ""  # why no gate confirmed the last change that was made all the same
         start = self._declare(START_SPECS)

@@ -20,6 +20,7 @@ from crash_coach_pkg.plan import CrashPlan
 from crash_coach_pkg.plan_book import Event, EventKind, PlanBook
 from crash_coach_pkg.ros.convert import message_from_event, message_from_plan, plan_from_message
 from crash_coach_pkg.ros.endpoints import WatchedPublisher
+from crash_coach_pkg.ros.parameter_service import CheckedParameterService
 from crash_coach_pkg.ros.run import EVENTS, PLAN, TICK_S, refuse_unknown_parameters, robot_names
 from sim_pkg.contract import UserError
 
@@ -71,7 +72,8 @@ class GateBase(Node):
     """
 
     def __init__(self, context: Context | None = None) -> None:
-        super().__init__("gate", context=context)
+        super().__init__("gate", context=context, start_parameter_services=False)
+        self._parameter_services = CheckedParameterService(self)
         self.robots = robot_names(self)
         self.command_type = self.text(
             "command_type", ACTION_TYPE, "Type of the robots' commands: package/msg/Type."
