@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 import yaml
+from typer.testing import CliRunner
 
+from crash_coach_bringup.cli.faults import app
 from crash_coach_bringup.cli.faults_docs import BLOCK, SET_LINES, generated, update
 from crash_coach_bringup.cli.output import CliError
 from crash_coach_pkg.config import FaultConfig, TeamSpec
@@ -33,6 +35,22 @@ def test_an_outdated_page_is_mended_and_a_broken_one_refused() -> None:
     assert update(old) == page
     with pytest.raises(CliError, match="once each: modes, settings, file, expectations"):
         update(page.replace("<!-- generated: modes -->", ""))
+
+
+def test_the_verb_prints_the_tables_or_mends_a_page(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["docs"])
+    assert done.exit_code == 0
+    assert all(block in done.output for block in generated().values())
+    page = tmp_path / "faults.md"
+    page.write_text(BLOCK.sub(lambda m: f"{m.group(1)}old\n{m.group(3)}", PAGE.read_text()))
+    assert CliRunner().invoke(app, ["docs", "--page", str(page)]).exit_code == 0
+    assert page.read_text() == PAGE.read_text()
+    for content, names in ((b"\xff", "not UTF-8"), (b"no blocks", "generated blocks none")):
+        page.write_bytes(content)
+        done = CliRunner().invoke(app, ["docs", "--page", str(page)])
+        assert isinstance(done.exception, CliError)
+        assert names in str(done.exception)
+        assert page.read_bytes() == content
 
 
 def test_every_mode_parameter_setting_and_expectation_is_there() -> None:

@@ -135,6 +135,8 @@ def docs_verb(
         return
     check_file_target("--page", page)
     try:
-        page.write_text(update(page.read_text()))
+        page.write_text(update(page.read_text("utf-8")), "utf-8")
+    except UnicodeDecodeError:
+        raise CliError(f"--page {page}: not UTF-8 text") from None
     except OSError as error:
         raise CliError(f"--page {page}: {error.strerror}") from None
