@@ -67,7 +67,7 @@ class Team:
             dt_s=self.spec.dt_s,
             episode_limit=self.spec.episode_limit,
         )
-        self.connections = connections(self.spec.robots, False, relay, self.spec.episode_limit)
+        self.connections = connections(self.spec.robots, False, self.spec.episode_limit)
 
     def play(self, cut_at: int | None = None) -> Made:
         session, spec = self.session, self.spec

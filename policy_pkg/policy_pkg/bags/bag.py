@@ -71,18 +71,22 @@ class Scan:
 
     about: the recorder's own words; None for a recording of `ros2 bag record`.
     kinds: of the messages that the bag holds; of a file without an end, what its first chunk lists.
+    certain: those of them of which there are messages for certain.
     robots: in the team's order.
     """
 
     def __init__(self, bag: Bag) -> None:
         self.about: About | None = None
-        channels: set[Channel] = set()
+        certain: set[Channel] = set()
+        possible: set[Channel] = set()
         for path in bag.files:
             found, listed = channels_of(path)
             begun = self._begin(path)
-            channels |= found if listed else begun
-        matches = [match for c in channels if (match := kind_of(c.topic)) is not None]
+            certain |= found
+            possible |= found if listed else begun
+        matches = [match for c in possible if (match := kind_of(c.topic)) is not None]
         self.kinds = {kind for kind, _ in matches}
+        self.certain = {match[0] for c in certain if (match := kind_of(c.topic)) is not None}
         self.robots = tuple(sorted({robot for _, robot in matches if robot}, key=natural))
         if self.about is not None:
             self.robots = self.about.robots

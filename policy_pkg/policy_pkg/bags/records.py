@@ -23,7 +23,7 @@ from mcap.records import Chunk, Message, Metadata, Schema
 from mcap.stream_reader import CRCValidationError, StreamReader
 
 from policy_pkg.bags.about import RECORD
-from policy_pkg.bags.problems import Problem, Report, Severity
+from policy_pkg.bags.problems import Problem, Report
 
 MAX_RECORD_BYTES = 1 << 28
 _RECORD = struct.Struct("<BQ")
@@ -207,7 +207,7 @@ def _lost(path: Path, at: int, error: BaseException) -> Problem:
     size = path.stat().st_size
     if isinstance(error, EndOfFile) or at >= size:
         text = f"is cut off at byte {size}: the recorder was killed, or the file was truncated"
-        return Problem(str(path), text, Severity.INCOMPLETE)
+        return Problem(str(path), text)
     return Problem(str(path), f"is damaged before byte {at}; the rest is left out: {_why(error)}")
 
 

@@ -79,17 +79,17 @@ class Connection:
 
 
 def connections(
-    robots: tuple[str, ...], odometry: bool, seen: bool, episode_limit: int
+    robots: tuple[str, ...], odometry: bool, episode_limit: int
 ) -> tuple[Connection, ...]:
     """Everything that the recorder records of a team; docs/ros.md has the offered QoS.
 
     odometry: also /<robot>/odom, which the sim builds only while somebody listens.
-    seen: also /<robot>/observation_seen, which exists where the gate relays observations.
     """
-    kinds = [Kind.OBSERVATION, *([Kind.SEEN] if seen else []), Kind.INTENT, Kind.COMMAND]
     out = [Connection(EPISODE_TOPIC, TYPES[Kind.STATE], max(episode_limit, 1) + 1, latched=True)]
     out += [
-        Connection(f"/{robot}/{kind.value}", TYPES[kind], 1) for robot in robots for kind in kinds
+        Connection(f"/{robot}/{kind.value}", TYPES[kind], 1)
+        for robot in robots
+        for kind in OF_ROBOT
     ]
     out.append(Connection(Kind.PLAN.value, TYPES[Kind.PLAN], 1, latched=True))
     out.append(Connection(Kind.EVENT.value, TYPES[Kind.EVENT], 100))

@@ -31,6 +31,7 @@ from sim_pkg.contract import UserError
 
 SPIN_S = 0.1  # how soon a signal is noticed
 _DEPTH = 2000  # of each topic: what may wait for this process while it is not scheduled
+_LINGER_S = 0.5  # for what is still on its way when the last episode's end is here
 _LOOK_S = 1.0  # how often drops are told
 _CLASSES = {
     message.__name__: message
@@ -54,7 +55,6 @@ class RecorderNode(Node):
         self._connections = connections(
             tuple(parameters.robots),
             parameters.odometry,
-            parameters.seen,
             parameters.episode_limit,
         )
         typestore = load_typestore(_interfaces())
@@ -150,6 +150,9 @@ def _record(received: list[int]) -> str:
         node.get_logger().info("recording")
         while not received and not node.done:
             executor.spin_once(timeout_sec=SPIN_S)
+        end_s = time.monotonic() + _LINGER_S
+        while not received and (left_s := end_s - time.monotonic()) > 0:
+            executor.spin_once(timeout_sec=left_s)
     finally:
         # In this order: DDS must not call back into what is gone (the executor first lets go).
         executor.shutdown()

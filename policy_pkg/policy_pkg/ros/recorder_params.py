@@ -30,7 +30,6 @@ class RecorderParameters(BaseModel):
     dt_s: float = Field(0.0, ge=0, le=3600, description="control step; 0: not told")
     episode_limit: int = Field(0, ge=0, le=10**6, description="longest episode; 0: not told")
     odometry: bool = Field(False, description="also record odom; the sim then has to build it")
-    seen: bool = Field(False, description="also record observation_seen of a relaying gate")
     split_bytes: int = Field(1 << 30, ge=0, le=2**40, description="new file after; 0: never")
     split_episodes: int = Field(0, ge=0, le=10**9, description="new file after; 0: never")
     compression: Literal["zstd", "lz4", "none"] = Field("zstd", description="of the chunks")

@@ -163,7 +163,7 @@ class BagReading:
         return Wanted(
             decisions=about is not None and about.mode == "lockstep",
             effects=Kind.EVENT in kinds,
-            seen=Kind.SEEN in met,
+            seen=Kind.SEEN in met | self._scan.certain,
             intents=Kind.INTENT in kinds,
         )
 

@@ -1,0 +1,180 @@
+"""The recorder on a real graph: what it recorded is what the same seeds give in this process."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crash_coach_bringup.ros.graph import (
+    Process,
+    UpOptions,
+    check_team,
+    graph_environment,
+    graph_processes,
+    ros_arguments,
+)
+from crash_coach_bringup.ros.supervisor import Supervisor
+from crash_coach_pkg.coach import Coach
+from crash_coach_pkg.config import CoachConfig, TeamSpec
+from policy_pkg.bags.problems import Problem
+from policy_pkg.checkpoint import load_policy
+from policy_pkg.train.bag_dataset import RecordedEpisode, load_episodes
+from policy_pkg.train.episode import Episode
+from policy_pkg.train.rollout import Rollout
+from policy_pkg.untrained import write_untrained
+from sim_pkg.contract import EnvSpec
+from sim_pkg.env import make_env
+
+SEED = 11
+ARRAYS = ("obs", "state", "available", "actions", "reward", "faults")
+RANDOM = CoachConfig(strategy="fixed", crash_rate=0.5, crash_mode="random")
+MUTE = CoachConfig(strategy="fixed", crash_rate=0.5, crash_mode="mute", start_step=3)
+BLIND = CoachConfig(strategy="fixed", crash_rate=0.7, crash_mode="blind", duration_steps=4)
+
+
+def recorder(out: Path, spec: EnvSpec, episodes: int) -> Process:
+    parameters = {
+        "out": str(out),
+        "robots": list(spec.robots),
+        "scenario": spec.scenario,
+        "seed": SEED,
+        "dt_s": spec.dt_s,
+        "episode_limit": spec.episode_limit,
+        "episodes": episodes,
+    }
+    arguments = ros_arguments([], "", parameters)
+    return Process("recorder", (sys.executable, "-m", "policy_pkg.ros.recorder_node", *arguments))
+
+
+def record(folder: Path, domain: int, crash: CoachConfig, episodes: int) -> Path:
+    """Plays episodes 0.. over ROS; returns the recording's folder."""
+    spec = make_env("buttons", 1).spec
+    checkpoint = folder / "team" / "step_0"
+    write_untrained(checkpoint, spec, seed=4)
+    options = UpOptions(
+        "buttons", checkpoint, layout="single", seed=SEED, coach=crash, domain=domain,
+        sim={"match_timeout_s": 60.0},
+    )  # fmt: skip
+    processes = [
+        recorder(folder / "bag", spec, episodes),
+        *graph_processes(options, check_team(options)),
+    ]
+    with Supervisor(processes, folder / "logs", graph_environment(domain)) as graph:
+        ended = graph.wait(90.0)
+    assert [(one.name, one.exit_code) for one in ended] == [("recorder", 0)], ended
+    assert "dropped: none" in ended[0].tail
+    return folder / "bag"
+
+
+def rolled_out(
+    checkpoint: Path, crash: CoachConfig, episodes: int
+) -> dict[int, tuple[Episode, bool]]:
+    """The same episodes in this process, by number; their last situation as a bag has it."""
+    env = make_env("buttons", 1)
+    coach = Coach(crash, TeamSpec.of(env.spec), SEED)
+    policy = load_policy(checkpoint).policy
+    rollout = Rollout(env, policy, coach.plan, SEED, np.random.default_rng(0))
+    out: dict[int, tuple[Episode, bool]] = {}
+    while len(out) < episodes:
+        for finished in rollout.step(epsilon=0.0):
+            arrays = {name: getattr(finished.episode, name).copy() for name in ARRAYS}
+            if finished.episode.terminated:
+                arrays["obs"][-1] = 0
+                arrays["available"][-1] = False
+            out[len(out)] = (replace(finished.episode, **arrays), finished.success)
+    return out
+
+
+def compare(expected: dict[int, tuple[Episode, bool]], got: RecordedEpisode) -> None:
+    episode, success = expected[got.number]
+    assert (got.seed, got.success) == (SEED, success)
+    for name in ARRAYS:
+        one, other = getattr(episode, name), getattr(got.episode, name)
+        assert (one.dtype, one.shape) == (other.dtype, other.shape), name
+        assert one.tobytes() == other.tobytes(), f"episode {got.number}: {name}"
+    intended = got.episode.faults == 0
+    assert np.array_equal(got.intents[intended], got.episode.actions[intended])
+    assert (got.intents >= 0).all()
+    assert got.plan is not None
+    assert got.plan.episode == got.number
+
+
+def check_recording(folder: Path, domain: int, crash: CoachConfig, episodes: int) -> None:
+    bag = record(folder, domain, crash, episodes)
+    problems: list[Problem] = []
+    got = list(load_episodes([bag], report=problems.append))
+    expected = rolled_out(folder / "team" / "step_0", crash, episodes)
+    assert any(episode.faults.any() for episode, _ in expected.values())
+    for recorded in got:
+        if recorded.number < episodes:
+            compare(expected, recorded)
+    # The sim may begin before it has found the recorder; it goes on after the recorder's end.
+    wanted = set(range(episodes)) - {one.number for one in got}
+    assert wanted <= {0}, problems
+
+
+@pytest.mark.parametrize(
+    ("crash", "episodes"),
+    [(RANDOM, 20), (MUTE, 5), (BLIND, 5)],
+    ids=["random", "mute", "blind"],
+)
+def test_a_recording_equals_the_rollout(
+    tmp_path: Path, ros_env: dict[str, str], crash: CoachConfig, episodes: int
+) -> None:
+    check_recording(tmp_path, int(ros_env["ROS_DOMAIN_ID"]), crash, episodes)
+
+
+@pytest.mark.soak
+def test_500_recorded_episodes_equal_the_rollout(tmp_path: Path, ros_env: dict[str, str]) -> None:
+    check_recording(tmp_path, int(ros_env["ROS_DOMAIN_ID"]), RANDOM, 500)
+
+
+def start(out: Path, env: dict[str, str], parameters: dict[str, object]) -> subprocess.Popen[str]:
+    values = {"out": str(out), "robots": ["robot_1"]} | parameters
+    arguments = ros_arguments([], "", values)  # type: ignore[arg-type]
+    return subprocess.Popen(
+        [sys.executable, "-m", "policy_pkg.ros.recorder_node", *arguments],
+        env={**os.environ, **env},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def test_sigterm_ends_the_file(tmp_path: Path, ros_env: dict[str, str]) -> None:
+    child = start(tmp_path / "bag", ros_env, {})
+    assert child.stderr is not None
+    assert "recording" in child.stderr.readline()
+    child.send_signal(signal.SIGTERM)
+    out, err = child.communicate(timeout=20)
+    assert (child.returncode, err) == (0, "")
+    assert out.startswith("recorder: 0 messages, 0 episodes")
+    assert (tmp_path / "bag" / "bag_0.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")
+    json.loads((tmp_path / "bag" / "metadata.yaml").read_text())
+
+
+@pytest.mark.parametrize(
+    ("parameters", "text"),
+    [
+        ({"robots": ["1st"]}, "every robot needs a name of its own"),
+        ({"compresion": "zstd"}, "unknown parameter 'compresion'"),
+        ({"split_bytes": -1}, "parameter split_bytes = -1"),
+        ({"out": ""}, "parameter 'out' of recorder is missing"),
+    ],
+)
+def test_wrong_parameters_are_one_line(
+    tmp_path: Path, ros_env: dict[str, str], parameters: dict[str, object], text: str
+) -> None:
+    child = start(tmp_path / "bag", ros_env, parameters)
+    _, err = child.communicate(timeout=20)
+    assert child.returncode == 1
+    assert err.count("\n") == 1
+    assert text in err
