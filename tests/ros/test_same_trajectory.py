@@ -2,14 +2,38 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from os import cpu_count
 from pathlib import Path
 
 import pytest
+from fault_files import (
+    MODES,
+    SCENARIO,
+    TRIGGERS,
+    entry,
+    one_after_the_other,
+    when,
+    with_triggers,
+    write,
+)
 
 from crash_coach_bringup.ros.evaluation import evaluate_via_ros
 from crash_coach_bringup.ros.graph import Layout
+from crash_coach_pkg.fault_scenario import ScenarioPlanner, load_fault_scenario
 from policy_pkg.checkpoint import load_policy
-from policy_pkg.train.evaluate import Condition, at_rate, crash_free, evaluate, named
+from policy_pkg.train.evaluate import (
+    Condition,
+    Evaluation,
+    Planned,
+    at_rate,
+    crash_free,
+    evaluate,
+    named,
+)
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 
@@ -32,47 +56,98 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return untrained(tmp_path_factory.mktemp("team"), "buttons")
 
 
+@pytest.fixture(scope="module")
+def coverage(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return untrained(tmp_path_factory.mktemp("coverage"), SCENARIO)
+
+
+def in_core(
+    checkpoint: Path, condition: Condition | Path, episodes: int, scenario: str
+) -> Evaluation:
+    if isinstance(condition, Condition):
+        return evaluate(load_policy(checkpoint), scenario, condition, episodes, SEED, effects=True)
+    faults = load_fault_scenario(condition)
+    planned = Planned(condition.stem, lambda team, seed: ScenarioPlanner(faults, team, seed))
+    return evaluate(load_policy(checkpoint), scenario, planned, episodes, SEED, effects=True)
+
+
 def compare(
     checkpoint: Path,
-    condition: Condition,
+    condition: Condition | Path,
     layout: Layout,
     episodes: int,
     scenario: str = "buttons",
-) -> None:
-    expected = evaluate(load_policy(checkpoint), scenario, condition, episodes, SEED)
+) -> Evaluation:
+    expected = in_core(checkpoint, condition, episodes, scenario)
     got = evaluate_via_ros(checkpoint, scenario, condition, episodes, SEED, layout)
     assert got.summary() == expected.summary()
-    assert (got.condition, got.robots, got.seed) == (
-        expected.condition,
-        expected.robots,
-        expected.seed,
-    )
-    for mine, theirs in zip(got.episodes, expected.episodes, strict=True):
-        assert (mine.episode, mine.success, mine.steps) == (
-            theirs.episode,
-            theirs.success,
-            theirs.steps,
-        )
-        assert mine.trajectory_hash == theirs.trajectory_hash
-        assert mine.crashed == theirs.crashed
-        assert mine.episode_return == theirs.episode_return
+    assert got.effects == expected.effects
+    assert got == expected
+    return got
 
 
-@pytest.mark.parametrize(
-    ("layout", "condition"),
-    [("single", "rate"), ("team", "stay"), ("nodes", "random"), ("nodes", "crash-free")],
-)
+@contextmanager
+def busy_cores() -> Iterator[None]:
+    """A busy loop per core."""
+    loops = [
+        subprocess.Popen([sys.executable, "-c", "while True: pass"])
+        for _ in range(cpu_count() or 1)
+    ]
+    try:
+        yield
+        assert all(loop.poll() is None for loop in loops), "the machine was not loaded"
+    finally:
+        for loop in loops:
+            loop.kill()
+            loop.wait(timeout=10)
+
+
+@pytest.mark.parametrize(("layout", "condition"), [("team", "stay"), ("nodes", "random")])
 def test_core_and_ros_give_the_same_bits(checkpoint: Path, layout: Layout, condition: str) -> None:
     compare(checkpoint, CONDITIONS[condition], layout, episodes=4)
 
 
-@pytest.mark.parametrize("scenario", ["coverage", "transport", "skirmish/3s_vs_3z", "skirmish/8m"])
+@pytest.mark.parametrize("scenario", ["transport", "skirmish/3s_vs_3z", "skirmish/8m"])
 def test_every_kind_of_scenario(tmp_path: Path, scenario: str) -> None:
     checkpoint = untrained(tmp_path, scenario)
     compare(checkpoint, CONDITIONS["rate"], "single", episodes=2, scenario=scenario)
 
 
+def modes_of(evaluation: Evaluation) -> set[str]:
+    return {row.mode for row in evaluation.effects if row.kind == "EFFECT"}
+
+
+def test_every_mode_has_the_same_effects(coverage: Path, tmp_path: Path) -> None:
+    file = write(tmp_path / "modes.yaml", one_after_the_other())
+    got = compare(coverage, file, "nodes", 2, SCENARIO)
+    assert modes_of(got) == set(MODES)
+
+
+def test_every_trigger_has_the_same_effects_also_on_a_loaded_machine(
+    coverage: Path, tmp_path: Path
+) -> None:
+    file = write(tmp_path / "triggers.yaml", with_triggers("hazard", "near", "return"))
+    first = compare(coverage, file, "team", 2, SCENARIO)
+    assert len(modes_of(first)) > len(MODES) / 2
+    with busy_cores():
+        again = evaluate_via_ros(coverage, SCENARIO, file, 2, SEED, "single")
+    assert again == first
+
+
 @pytest.mark.soak
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("trigger", TRIGGERS)
+@pytest.mark.parametrize("mode", MODES)
+def test_every_mode_by_every_trigger(
+    coverage: Path, tmp_path: Path, mode: str, trigger: str
+) -> None:
+    faults = [entry(mode, robot, **when(trigger, 10 * robot)) for robot in range(3)]
+    got = compare(coverage, write(tmp_path / "one.yaml", faults), "single", 2, SCENARIO)
+    assert modes_of(got) == {mode}
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize("layout", ["single", "team", "nodes"])
 @pytest.mark.parametrize("condition", sorted(CONDITIONS))
 def test_64_episodes_give_the_same_bits(checkpoint: Path, layout: Layout, condition: str) -> None:
