@@ -46,6 +46,8 @@ app.command("calibrate")(calibrate.calibrate)
 
 def repeat_options(arguments: list[str]) -> list[str]:
     """['--crashed', '0', '1'] -> ['--crashed', '0', '--crashed', '1']"""
+    if arguments[:1] == ["faults"]:  # none of its options takes several values
+        return arguments
     out: list[str] = []
     option, values = "", 0
     for argument in arguments:
