@@ -15,6 +15,7 @@ from crash_coach_bringup.ros.graph import UpOptions, check_team, graph_environme
 from crash_coach_bringup.ros.inject import InjectError, InjectResult, clear, inject
 from crash_coach_bringup.ros.supervisor import Supervisor
 from policy_pkg.untrained import write_untrained
+from sim_pkg.contract import UserError
 from sim_pkg.env import make_env
 
 WAIT_S = 30.0
@@ -117,7 +118,6 @@ def test_a_part_of_each_episode(graph: Graph) -> None:
     [
         (("robot_9",), "mute", "next_step", 0, "unknown robot 'robot_9'.*robot_1, robot_2"),
         (("robot_1", "robot_1"), "mute", "next_step", 0, "robot_1 more than once"),
-        (("robot_1",), "explode", "next_step", 0, "crash_mode 'explode'.*'random'"),
         (("robot_1",), "mute", "now", 0, "apply_at 'now'.*'next_step'"),
         (("robot_1",), "mute", "next_step", -1, "duration_steps"),
     ],
@@ -127,6 +127,47 @@ def test_what_is_wrong_is_refused_whole(
 ) -> None:
     with pytest.raises(InjectError, match=f"the coach refused: .*{reason}"):
         inject(victims, mode, apply_at, duration, domain=graph.domain)
+    assert crashed(graph.episodes(1)) == {(0, 0)}
+
+
+def test_a_mode_with_parameters_instead_of_what_was_set_before(graph: Graph) -> None:
+    inject(("robot_1",), "delay", "next_episode", domain=graph.domain, parameters={"steps": 900})
+    result = inject(
+        ("robot_2",), "delay", "next_episode", domain=graph.domain, parameters={"steps": 2}
+    )
+    assert result.parameters == {"steps": 2}
+    assert str(result) == "robot_2: delay (steps 2) from the next episode on"
+    events: list[FaultEvent] = []
+    node = graph.client.node
+    reader = node.create_subscription(FaultEvent, "/coach/events", events.append, 1000)
+    states = graph.episodes(2)
+    node.destroy_subscription(reader)
+    assert crashed(states) == {(0, 1)}
+    effects = {
+        (e.episode, e.step): e
+        for e in events
+        if e.kind == FaultEvent.EFFECT and e.episode == states[0].episode
+    }
+    assert [effects[states[0].episode, step].applied for step in (0, 1)] == [-1, -1]
+    assert {(e.robot, e.mode) for e in effects.values()} == {("robot_2", "delay")}
+    late = [effects[key].applied for key in sorted(effects)]
+    intents = [effects[key].intent for key in sorted(effects)]
+    # What is not available any more two steps later is not passed on.
+    pairs = list(zip(late[2:], intents[:-2], strict=True))
+    assert pairs
+    assert all(applied in (intent, -1) for applied, intent in pairs)
+
+
+def test_unknown_modes_and_parameters_are_named(graph: Graph) -> None:
+    with pytest.raises(UserError, match=r"unknown crash mode 'explode'; one of: mute, random"):
+        inject(("robot_1",), "explode", domain=graph.domain)
+    with pytest.raises(UserError, match=r"crash mode delay: parameter stps .*steps"):
+        inject(("robot_1",), "delay", domain=graph.domain, parameters={"stps": 1})
+
+
+def test_what_the_gate_cannot_do_is_refused_with_its_reason(graph: Graph) -> None:
+    with pytest.raises(InjectError, match=r"the coach refused: the gate refused: .*observations"):
+        inject(("robot_1",), "blind", domain=graph.domain)
     assert crashed(graph.episodes(1)) == {(0, 0)}
 
 
