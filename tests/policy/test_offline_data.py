@@ -52,9 +52,11 @@ def test_an_episode_given_twice_is_counted() -> None:
     assert load([*recordings, recordings[1]]).duplicates == 1
 
 
-def test_no_episode_is_an_error() -> None:
+@pytest.mark.parametrize("scenario", [None, "buttons"])
+def test_no_episode_is_an_error(scenario: str | None) -> None:
+    spec = make_env(scenario, 1).spec if scenario else None
     with pytest.raises(DataError, match="no complete episode"):
-        load([])
+        load_data([], spec, 10)
 
 
 def test_more_than_the_bound_names_it_and_the_key() -> None:

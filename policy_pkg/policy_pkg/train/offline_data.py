@@ -101,7 +101,7 @@ def load_data(
         _check(one, robots, sizes, name)
         entries.append(_entry(one))
         _check_bound(sizes, len(entries), memory_limit_mib)
-    if sizes is None:
+    if sizes is None or not entries:
         raise DataError("the recordings hold no complete episode: there is nothing to learn from")
     entries.sort(key=lambda entry: entry.key)
     return _fixed(robots, deque(entries), sizes)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 import torch
 
@@ -25,9 +26,10 @@ class Optimiser:
         self._optimiser = _make(config, self._flat)
 
     def gradient_norm(self) -> float:
-        """Of all parameters' gradient together."""
+        """Of all parameters' gradient together; inf or NaN where it is not finite."""
         gradient = self._parameters.gradient
-        return math.sqrt(float(gradient @ gradient))
+        with np.errstate(invalid="ignore", over="ignore"):
+            return math.sqrt(float(gradient @ gradient))
 
     def step(self, norm: float) -> None:
         """Scales the gradient of this ``norm`` down to the bound, and takes one step."""
