@@ -99,19 +99,21 @@ class Schedule:
     def _room_for(self, fault: Fault, step: int) -> bool:
         """Whether ``fault`` may begin: the cap holds in all of its time.
 
-        Room is kept for the robots whose start step lies within it, so that these never wait.
+        Room is kept for robots that have a start step, so that these never wait.
         """
         others = {
             other.robot
             for place, other in enumerate(self._plan.faults)
             if other.robot != fault.robot
-            and (self._since[place] != _NEVER or _comes_within(other, fault, step))
+            and (self._since[place] != _NEVER or _overlaps(other, fault, step))
         }
         return len(others) < self._plan.cap
 
 
-def _comes_within(other: Fault, fault: Fault, step: int) -> bool:
-    """Whether ``other`` starts by its start step while ``fault``, begun at ``step``, lasts."""
-    if other.trigger.kind != TriggerKind.STEP or other.start_step <= step:
+def _overlaps(other: Fault, fault: Fault, step: int) -> bool:
+    """Whether ``other`` is in force by its start step while ``fault``, begun at ``step``, lasts."""
+    if other.trigger.kind != TriggerKind.STEP:
+        return False
+    if other.duration_steps and other.start_step + other.duration_steps <= step:
         return False
     return not fault.duration_steps or other.start_step < step + fault.duration_steps
