@@ -8,6 +8,7 @@ import sys
 import typer
 
 from crash_coach_bringup.cli import (
+    bags,
     calibrate,
     demo,
     doctor,
@@ -15,14 +16,18 @@ from crash_coach_bringup.cli import (
     faults,
     inject,
     plot,
+    record,
     render,
     train,
+    train_offline,
     up,
 )
 from sim_pkg.contract import UserError
 
 # Options that take several values, up to the next option: --crashed 0 1 2
-SEVERAL = {"--crash-rate", "--crashed", "--victims", "--set", "--seed", "--policy", "--param"}
+SEVERAL = {
+    "--crash-rate", "--crashed", "--victims", "--set", "--seed", "--policy", "--param", "--robots",
+}  # fmt: skip
 
 app = typer.Typer(
     name="crash-coach",
@@ -34,10 +39,13 @@ app = typer.Typer(
 )
 app.command("doctor")(doctor.doctor)
 app.command("train")(train.train)
+app.command("train-offline")(train_offline.train_offline)
 app.command("evaluate")(evaluate.evaluate)
 app.add_typer(faults.app, name="faults")
 app.command("up")(up.up)
 app.command("inject")(inject.inject)
+app.command("record")(record.record)
+app.add_typer(bags.app, name="bags")
 app.command("demo")(demo.demo)
 app.command("plot")(plot.plot)
 app.command("render")(render.render)
