@@ -1,63 +1,27 @@
-"""The gate's pure core, case by case. The laws over random plans: test_gate_laws.py."""
+"""The gate's pure core: plans, leases, duplicates. Laws over random plans: test_gate_laws.py."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from gate_cases import (
+    LEASE_S,
+    MUTE_0,
+    RANDOM_1,
+    brief,
+    command,
+    decisions,
+    gate,
+    plan,
+    sight,
+)
 
 from crash_coach_pkg.bits import random_bits
 from crash_coach_pkg.effects import WITHHELD
 from crash_coach_pkg.gate import random_available
-from crash_coach_pkg.gate_state import GateState
-from crash_coach_pkg.gate_types import Command, Decision, Outputs, Sight
-from crash_coach_pkg.plan import NEXT_STEP, CrashPlan, Fault
-from crash_coach_pkg.plan_book import TEAM, Event, EventKind
-from sim_pkg.contract import BoolArray
-
-LEASE_S = 1.0
-MUTE_0 = Fault(robot=0, mode="mute")
-RANDOM_1 = Fault(robot=1, mode="random")
-
-
-def plan(episode: int, revision: int, *faults: Fault) -> CrashPlan:
-    return CrashPlan(episode, revision, seed=7, rate=0.1, cap=1, faults=faults)
-
-
-def gate(lockstep: bool = True) -> GateState:
-    return GateState(2, lockstep, first_lease_s=10.0)
-
-
-def command(robot: int, episode: int, step: int, action: int = 3) -> Command:
-    return Command(robot, episode, step, action, token=(robot, episode, step))
-
-
-def sight(robot: int, episode: int, step: int, available: BoolArray) -> Sight:
-    return Sight(robot, episode, step, np.zeros(2, dtype=np.float32), available)
-
-
-def brief(outputs: Outputs) -> list[tuple[object, ...]]:
-    """Decisions as (robot, episode, step, mode, applied), the team's events as (kind, episode,
-    step); those of a robot are left out."""
-    return [
-        (o.kind, o.episode, o.step)
-        if isinstance(o, Event)
-        else (o.command.robot, *o.command.key, o.mode, o.applied)
-        for o in outputs
-        if not isinstance(o, Event) or o.robot == TEAM
-    ]
-
-
-def decisions(outputs: Outputs) -> list[Decision]:
-    return [o for o in outputs if isinstance(o, Decision)]
-
-
-def changes(outputs: Outputs) -> list[tuple[object, ...]]:
-    """Events of robots as (kind, robot, step, mode)."""
-    return [
-        (o.kind, o.robot, o.step, o.mode)
-        for o in outputs
-        if isinstance(o, Event) and o.robot != TEAM
-    ]
+from crash_coach_pkg.gate_types import Command, Decision
+from crash_coach_pkg.plan import NEXT_STEP, Fault
+from crash_coach_pkg.plan_book import EventKind
 
 
 def test_lockstep_holds_until_the_plan_of_the_episode() -> None:
@@ -155,9 +119,8 @@ def test_random_waits_for_the_availability_of_its_step_and_is_keyed() -> None:
     assert state.watched_robots == {1}
     available = np.array([True, False, True, True, False])
     assert state.observation(sight(1, 2, 3, available), 0.0) == ()
-    assert (
-        decisions(state.command(command(1, 2, 4), 0.0)) == []
-    )  # an older step's availability is no good
+    # An older step's availability is no good.
+    assert decisions(state.command(command(1, 2, 4), 0.0)) == []
     (decision,) = state.observation(sight(1, 2, 4, available), 0.0)
     assert isinstance(decision, Decision)
     expected = random_available(random_bits(7, 2, 4, 1), available[None, :])[0]

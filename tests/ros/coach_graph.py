@@ -7,11 +7,12 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 
 import rclpy
 from ament_index_python import get_package_prefix
@@ -92,7 +93,9 @@ class Outcome:
 
     @property
     def done(self) -> bool:
-        return self.command is not None or any(e.applied < 0 for e in self.effects)
+        return self.command is not None or any(
+            e.applied == FaultEvent.WITHHELD for e in self.effects
+        )
 
     @property
     def faulted(self) -> bool:
@@ -138,7 +141,7 @@ class Team:
 
     def _on_event(self, message: FaultEvent) -> None:
         self.events.append(message)
-        if message.kind == FaultEvent.EFFECT:
+        if message.kind == FaultEvent.EFFECT and message.applied != FaultEvent.OBSERVED:
             key = (message.episode, message.step, ROBOTS.index(message.robot))
             self.outcomes[key].effects.append(message)
 
@@ -254,10 +257,17 @@ def operator(env: dict[str, str]) -> Iterator[Operator]:
 
 
 @contextmanager
-def graph(env: dict[str, str], lockstep: bool = True, **coach: object) -> Iterator[Graph]:
-    """``coach``: its parameters at start, beside the robots."""
+def graph(
+    env: dict[str, str],
+    lockstep: bool = True,
+    gate: Mapping[str, object] = MappingProxyType({}),
+    **coach: object,
+) -> Iterator[Graph]:
+    """``coach`` and ``gate``: their parameters at start, beside the robots."""
     with ExitStack() as stack:
-        gate_process = stack.enter_context(process(env, "gate", robots=ROBOTS, lockstep=lockstep))
+        gate_process = stack.enter_context(
+            process(env, "gate", robots=ROBOTS, lockstep=lockstep, **gate)
+        )
         coach_process = stack.enter_context(process(env, "coach", robots=ROBOTS, **coach))
         played = stack.enter_context(team(env))
         played.meet(follows=bool(coach.get("follow_sim", True)))

@@ -11,7 +11,8 @@ import pytest
 from coach_graph import ROBOTS, WAIT_S, graph, process, run_to_end, team
 from crash_coach_interfaces.msg import Action, FaultEvent
 
-from crash_coach_pkg.gate import random_available, random_bits
+from crash_coach_pkg.bits import random_bits
+from crash_coach_pkg.gate import random_available
 
 AVAILABLE = np.array([[True, True, True, True, False]])
 
@@ -93,8 +94,11 @@ def test_a_restarted_coach_takes_over(ros_env: dict[str, str]) -> None:
             new = g.team.plans[-1].revision
             assert new > old
             g.team.until(lambda: new in g.team.armed(), "the new plan armed")
-            assert [o.faulted for o in g.team.step(0, 1)] == [False, False, True]
+            # It takes over the plan of the running episode, and makes those of the next ones.
+            assert [o.faulted for o in g.team.step(0, 1)] == [True, False, False]
             assert FaultEvent.EXPIRED not in g.team.kinds()
+            assert FaultEvent.CLEARED not in g.team.kinds()
+            assert [o.faulted for o in g.team.step(1, 0)] == [False, False, True]
 
 
 def test_duplicates_are_answered_alike_and_decided_once(ros_env: dict[str, str]) -> None:
@@ -140,7 +144,10 @@ def test_signals_end_it_cleanly(ros_env: dict[str, str], name: str, number: int)
     [
         ({}, "parameter 'robots' of gate is missing"),
         ({"robots": ("robot 1",)}, "robot name 'robot 1' is not a valid ROS name"),
-        ({"robots": ("a",), "lockstp": True}, "unknown parameter 'lockstp' of gate; known: first"),
+        (
+            {"robots": ("a",), "lockstp": True},
+            "unknown parameter 'lockstp' of gate; known: cmd_timeout_s",
+        ),
         ({"robots": ("a",), "first_lease_s": -1.0}, "first_lease_s"),
     ],
 )
