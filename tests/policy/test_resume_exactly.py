@@ -89,6 +89,38 @@ def test_stopping_anywhere_and_resuming_changes_no_bit(
     assert_same_run(run, whole)
 
 
+def test_faults_with_memory_go_on_where_they_were(tmp_path: Path) -> None:
+    """Commands under way in a delay, and a hazard between two strikes."""
+    coach = {
+        "strategy": "fixed",
+        "crash_mode": "delay",
+        "crash_parameters": {"steps": 2},
+        "hazard_rate_hz": 0.5,
+        "duration_steps": 5,
+        "min_alive": 1,
+    }
+    settings = {**CONFIG.model_dump(), "total_steps": 800, "coach": coach}
+    config = TrainConfig.model_validate(settings)
+    train(config, tmp_path / "whole")
+
+    def stop(report: ProgressReport) -> None:
+        if report.env_steps >= 600:
+            raise Stopped
+
+    ticks = iter(range(10**9))
+    with pytest.raises(Stopped):
+        train(config, tmp_path / "run", progress=stop, clock=lambda: float(next(ticks)))
+    assert read_manifest(find_checkpoint(tmp_path / "run")).progress["env_steps"] == 400
+    train(config, tmp_path / "run", resume=True)
+    assert_same_run(tmp_path / "run", tmp_path / "whole")
+    replay = read_tensors(
+        find_checkpoint(tmp_path / "run"),
+        read_manifest(find_checkpoint(tmp_path / "run")),
+        "replay",
+    )
+    assert 4 in replay["faults"]
+
+
 SCRIPT = """
 import sys
 from pathlib import Path

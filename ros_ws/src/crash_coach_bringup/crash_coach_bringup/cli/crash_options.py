@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from crash_coach_bringup.cli.output import CliError
-from crash_coach_pkg.faults import check_parameters, fault_mode, mode_names
+from crash_coach_pkg.faults import check_parameters, fault_mode
 from policy_pkg.train.evaluate import Condition, at_rate, crash_free, exactly, named
 from sim_pkg.contract import UserError
 
@@ -18,7 +18,8 @@ CrashedOption = Annotated[
 ModeOption = Annotated[
     str,
     typer.Option(
-        help=f"What happens to a crashed robot: stay, {', '.join(mode_names())} (docs/faults.md)."
+        help="What happens to a crashed robot: mute, random, delay or another mode of "
+        "docs/faults.md, or an installed one."
     ),
 ]
 ParamOption = Annotated[
