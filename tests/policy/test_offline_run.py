@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,7 @@ SMALL: dict[str, Any] = {
         "target_update_interval_episodes": 15,
     },
 }
+DOCUMENT = Path(__file__).parents[2] / "docs" / "algorithms.md"
 CONSERVATIVE = {**SMALL["learner"], "conservative_weight": 1.0}
 
 
@@ -81,6 +83,9 @@ def test_a_run_writes_what_it_promises(tmp_path: Path, recordings: list[Recordin
         for condition in ("crash_free", "1_crashed")
     }
     assert set(blocks[0]) == {"gradient_steps", "epochs", *played, *MEANS}
+    table = DOCUMENT.read_text().split("| key of `metrics.jsonl` |")[1].split("\n\n")[0]
+    first_cells = [row.split("|")[1] for row in table.splitlines()[2:]]
+    assert set(re.findall(r"`(\w+)`", "".join(first_cells))) == set(blocks[0])
     assert blocks[-1]["epochs"] == 50 * 8 / 40
     assert blocks[0]["loss"] is None
     assert blocks[-1]["agreement"] is None

@@ -86,7 +86,7 @@ class Cloner:
         greedy = np.where(batch.available[batch.now], shaped, -np.inf).argmax(2)
         kept = batch.faults == 0
         same = np.count_nonzero((greedy == batch.actions) & kept)
-        return same / max(1, int(np.count_nonzero(kept)))
+        return float(same) / max(1, int(np.count_nonzero(kept)))
 
     def agent_weights(self) -> Arrays:
         """The agent net by torch's names; views that follow every update."""
