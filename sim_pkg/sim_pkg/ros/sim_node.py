@@ -23,7 +23,6 @@ from sim_pkg.env import make_env
 from sim_pkg.lockstep import Decisions
 from sim_pkg.realtime import NewestCommands
 from sim_pkg.ros import convert
-from sim_pkg.ros.parameter_service import CheckedParameterService
 from sim_pkg.ros.sim_lock import SecondSimError, only_sim
 from sim_pkg.ros.sim_params import read_parameters
 from sim_pkg.ros.sim_topics import SimTopics
@@ -50,7 +49,6 @@ class SimNode(Node):
 
     def __init__(self) -> None:
         super().__init__("sim", start_parameter_services=False)
-        self._parameter_services = CheckedParameterService(self)
         self.failure: str | None = None
         self._params = params = read_parameters(self)
         self._env = env = make_env(params.scenario, 1)

@@ -9,6 +9,7 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 
 from sim_pkg.config import ConfigError, StrictModel, did_you_mean
+from sim_pkg.ros.parameter_service import CheckedParameterService
 
 _OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides")
 
@@ -42,11 +43,13 @@ class SimParameters(StrictModel):
 
 
 def read_parameters(node: Node) -> SimParameters:
-    """Declares the parameters on ``node`` and returns what was set on the command line.
+    """Declares the parameters on ``node``, serves them (made without rclpy's own services), and
+    returns what was set on the command line.
 
     Raises:
         ConfigError: an unknown name, a wrong type, NaN, or a value out of range.
     """
+    CheckedParameterService(node)
     known = SimParameters.model_fields
     for name in node._parameter_overrides:
         if name not in known and name.split(".")[0] not in _OF_RCLPY:
