@@ -43,10 +43,13 @@ def test_alone_in_a_team_and_by_the_formula_the_actions_are_the_same(bundle: Pol
                 np.arange(ROBOTS, dtype=np.int32),
                 hidden,
             )
-            expected = greedy(q, np.stack([s.available for s in sensed]).astype(bool)).tolist()
+            available = np.stack([s.available for s in sensed]).astype(bool)
+            expected = greedy(q, available).tolist()
             together = [a for i in (2, 0, 1) for a in team.receive(i, sensed[i])]
             assert actions(together) == expected
             assert [a.robot for a in together] == [0, 1, 2]
+            least = [min(np.flatnonzero(a), key=q[i].__getitem__) for i, a in enumerate(available)]
+            assert [a.worst_action for a in together] == least
             assert [a.stamp for a in together] == [f"{episode}/{step}"] * ROBOTS
             assert [actions(alone[i].receive(0, sensed[i]))[0] for i in range(ROBOTS)] == expected
             last = expected

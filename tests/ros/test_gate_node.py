@@ -83,24 +83,6 @@ def test_a_killed_coach_leaves_no_fault_behind(ros_env: dict[str, str]) -> None:
         assert g.team.kinds().count(FaultEvent.EXPIRED) == 1
 
 
-def test_a_restarted_coach_takes_over(ros_env: dict[str, str]) -> None:
-    with graph(ros_env, victims=("robot_1",), lease_s=30.0) as g:
-        assert g.team.step(0, 0)[0].faulted
-        g.team.until(lambda: bool(g.team.plans), "the first coach's plan")
-        old = g.team.plans[-1].revision
-        os.killpg(g.coach.pid, signal.SIGKILL)
-        with process(ros_env, "coach", robots=ROBOTS, victims=("robot_3",)):
-            g.team.until(lambda: g.team.plans[-1].revision != old, "the new coach's plan")
-            new = g.team.plans[-1].revision
-            assert new > old
-            g.team.until(lambda: new in g.team.armed(), "the new plan armed")
-            # It takes over the plan of the running episode, and makes those of the next ones.
-            assert [o.faulted for o in g.team.step(0, 1)] == [True, False, False]
-            assert FaultEvent.EXPIRED not in g.team.kinds()
-            assert FaultEvent.CLEARED not in g.team.kinds()
-            assert [o.faulted for o in g.team.step(1, 0)] == [False, False, True]
-
-
 def test_duplicates_are_answered_alike_and_decided_once(ros_env: dict[str, str]) -> None:
     with graph(ros_env, victims=("robot_2",), crash_mode="random") as g:
         first = [outcome.command for outcome in g.team.step(0, 0)]

@@ -54,9 +54,10 @@ def test_the_wire_format_is_rclpys(frame_id: str, sizes: tuple[int, int]) -> Non
     assert (sensed.episode, sensed.step, sensed.last_action) == (2**32 - 1, 7, -1)
     assert np.array_equal(sensed.features, features)
     assert np.array_equal(sensed.available, available)
-    answer = bytes_from_answer(Answer(0, sensed.episode, sensed.step, 3, sensed.stamp))
+    answer = bytes_from_answer(Answer(0, sensed.episode, sensed.step, 3, 4, sensed.stamp))
     command = deserialize_message(answer, Action)
-    assert command == Action(header=message.header, episode=2**32 - 1, step=7, action=3)
+    expected = Action(header=message.header, episode=2**32 - 1, step=7, action=3, worst_action=4)
+    assert command == expected
     with pytest.raises(UserError, match="cut short"):
         sensed_from_bytes(data[: len(data) // 2])
     with pytest.raises(UserError, match="0000 is not little-endian CDR"):

@@ -34,6 +34,13 @@ def up(
     ] = False,
     episodes: Annotated[int, typer.Option(help="End after this many; 0: run on.", min=0)] = 0,
     seed: Annotated[int, typer.Option(help="Seed of episodes and crashes.", min=0)] = 0,
+    relay_observations: Annotated[
+        bool,
+        typer.Option(
+            "--relay-observations",
+            help="Observations pass through the gate: blind, stale and noise can be injected.",
+        ),
+    ] = False,
     logs: Annotated[Path, typer.Option(help="Folder for the nodes' logs.")] = Path("runs/up"),
 ) -> None:
     """Starts sim, policies, gate and coach, one process each, until Ctrl-C or a node dies."""
@@ -47,6 +54,7 @@ def up(
         layout="team" if team_process else "nodes",
         episodes=episodes,
         seed=seed,
+        relay_observations=relay_observations,
         log_dir=logs,
     )
     raise typer.Exit(run_up(options, show))
