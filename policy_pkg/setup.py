@@ -10,7 +10,7 @@ setup(
     maintainer_email="team@crash-coach.dev",
     license="Apache-2.0",
     packages=["policy_pkg", "policy_pkg.bags", "policy_pkg.ros", "policy_pkg.train"],
-    package_data={"policy_pkg": ["configs/**/*.yaml"]},
+    package_data={"policy_pkg": ["configs/**/*.yaml", "ros/*.xml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
         (f"share/{package}", ["package.xml"]),

@@ -26,6 +26,7 @@ from crash_coach_pkg.coach import Coach
 from crash_coach_pkg.config import CoachConfig, TeamSpec
 from policy_pkg.bags.problems import Problem
 from policy_pkg.checkpoint import load_policy
+from policy_pkg.ros.recorder_node import PROFILE, PROFILE_VARIABLE
 from policy_pkg.train.bag_dataset import RecordedEpisode, load_episodes
 from policy_pkg.train.episode import Episode
 from policy_pkg.train.rollout import Rollout
@@ -67,10 +68,11 @@ def record(folder: Path, domain: int, crash: CoachConfig, episodes: int) -> Path
         recorder(folder / "bag", spec, episodes),
         *graph_processes(options, check_team(options)),
     ]
-    with Supervisor(processes, folder / "logs", graph_environment(domain)) as graph:
+    environment = {**graph_environment(domain), PROFILE_VARIABLE: str(PROFILE)}
+    with Supervisor(processes, folder / "logs", environment) as graph:
         ended = graph.wait(90.0)
     assert [(one.name, one.exit_code) for one in ended] == [("recorder", 0)], ended
-    assert "dropped: none" in ended[0].tail
+    assert "lost: none" in ended[0].tail
     return folder / "bag"
 
 

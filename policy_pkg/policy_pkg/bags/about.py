@@ -27,7 +27,7 @@ class About:
     dt_s: float = 0.0
     episode_limit: int = 0
     drops: Mapping[str, int] = field(default_factory=dict)
-    """Messages lost in the recorder, by topic, up to where this was written."""
+    """Messages lost in the recorder or on the way to it, by topic, up to where this was written."""
 
     def to_record(self) -> dict[str, str]:
         """As an MCAP metadata record: JSON values, and a checksum, as MCAP has none for it."""

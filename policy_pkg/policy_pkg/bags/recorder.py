@@ -23,7 +23,8 @@ _PAUSE_S = 0.05  # how long messages gather before the thread wakes for them
 class Recorder:
     """``put`` takes messages as fast as they come; one thread writes them.
 
-    What does not fit the queue is dropped and counted by topic, in ``drops`` and in the file.
+    What does not fit the queue is dropped and counted by topic, in ``drops`` and in the file; so is
+    what the middleware says it lost.
 
     Args:
         writer: used by this recorder's thread alone from here on.
@@ -63,9 +64,13 @@ class Recorder:
         else:
             self._queue.append((connection, self._now_ns(), data))
 
+    def lost(self, connection: int, count: int) -> None:
+        """The middleware tells that messages were lost before they came here."""
+        self._dropped[connection] += count
+
     @property
     def drops(self) -> dict[str, int]:
-        """Messages that found the queue full, by topic."""
+        """Messages that found the queue full or were lost on their way here, by topic."""
         dropped = dict(self._dropped)  # copied at once: ``put`` may run meanwhile
         return {self._connections[i].topic: n for i, n in sorted(dropped.items())}
 

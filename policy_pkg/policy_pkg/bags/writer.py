@@ -94,6 +94,7 @@ class BagWriter:
         self._flush_s = flush_s
         self._files: list[_File] = []
         self._episodes = 0  # ended in this file
+        self._full = False  # the next message begins a new file
         _make(folder)
         self._open()
 
@@ -104,6 +105,9 @@ class BagWriter:
 
     def write(self, connection: int, log_time_ns: int, publish_time_ns: int, data: bytes) -> None:
         """One serialized message on ``connections[connection]``."""
+        if self._full:
+            self._finish()
+            self._open()
         file = self._files[-1]
         file.count(connection, log_time_ns)
         self._writer.add_message(
@@ -114,12 +118,12 @@ class BagWriter:
             file.counts[connection] - 1,
         )
         if self._split.bytes and self._stream.tell() >= self._split.bytes:
-            self._roll()
+            self._full = True
 
     def episode_ended(self) -> None:
         self._episodes += 1
         if self._split.episodes and self._episodes >= self._split.episodes:
-            self._roll()
+            self._full = True
 
     def tick(self) -> None:
         """Flushes when it is due; to be called often, also while nothing comes."""
@@ -139,10 +143,6 @@ class BagWriter:
     def _flush(self) -> None:
         self._writer.flush()  # type: ignore[no-untyped-call]
         self._flushed_s = self._clock()
-
-    def _roll(self) -> None:
-        self._finish()
-        self._open()
 
     def _open(self) -> None:
         name = f"{self._folder.name}_{len(self._files)}.mcap"
@@ -171,6 +171,7 @@ class BagWriter:
         ]
         self._files.append(_File(name))
         self._episodes = 0
+        self._full = False
         self._flush()
         self._write_metadata()
 

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import gc
+import os
 import signal
 import sys
 import time
 from functools import partial
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import rclpy
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from crash_coach_interfaces.msg import Action, CrashPlan, EpisodeState, FaultEvent, Observation
 from nav_msgs.msg import Odometry
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.experimental import EventsExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -29,6 +32,8 @@ from policy_pkg.bags.writer import BagWriter, Split
 from policy_pkg.ros.recorder_params import RecorderParameters, read_parameters
 from sim_pkg.contract import UserError
 
+PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+PROFILE = Path(__file__).with_name("recorder_fastdds.xml")
 SPIN_S = 0.1  # how soon a signal is noticed
 _DEPTH = 2000  # of each topic: what may wait for this process while it is not scheduled
 _LINGER_S = 0.5  # for what is still on its way when the last episode's end is here
@@ -75,6 +80,9 @@ class RecorderNode(Node):
                 partial(self._recorder.put, index),
                 _qos(connection),
                 raw=True,
+                event_callbacks=SubscriptionEventCallbacks(
+                    message_lost=partial(self._on_lost, index)
+                ),
             )
         self._told: dict[str, int] = {}
         self.create_timer(_LOOK_S, self._tell_drops)
@@ -99,14 +107,17 @@ class RecorderNode(Node):
         lost = _list(drops) if drops else "none"
         return (
             f"{self._recorder.messages} messages, {self._recorder.episodes} episodes in "
-            f"{self._parameters_read.out}; dropped: {lost}"
+            f"{self._parameters_read.out}; lost: {lost}"
         )
+
+    def _on_lost(self, connection: int, status: Any) -> None:
+        self._recorder.lost(connection, status.total_count_change)
 
     def _tell_drops(self) -> None:
         drops = self._recorder.drops
         if drops != self._told:
             self._told = drops
-            self.get_logger().error(f"dropped so far, the queue being full: {_list(drops)}")
+            self.get_logger().error(f"messages lost so far: {_list(drops)}")
 
 
 def _about(parameters: RecorderParameters) -> About:
@@ -171,6 +182,8 @@ def main() -> int:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, note)
+    # Read when the first node is made. Whoever set it knows better.
+    os.environ.setdefault(PROFILE_VARIABLE, str(PROFILE))
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         print(f"recorder: {_record(received)}", flush=True)  # noqa: T201

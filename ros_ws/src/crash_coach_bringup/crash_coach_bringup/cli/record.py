@@ -84,9 +84,7 @@ def record(
         "split_episodes": split_episodes,
         "compression": compression.value,
     }
-    from crash_coach_bringup.ros.discovery import use_quick_discovery
     from crash_coach_bringup.ros.graph import ros_arguments
 
-    use_quick_discovery()
     # In place of this process: signals reach the recorder itself.
     os.execv(sys.executable, [sys.executable, "-m", MODULE, *ros_arguments([], "", parameters)])
