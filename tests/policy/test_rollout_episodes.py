@@ -137,3 +137,12 @@ def test_a_changed_environment_is_noticed_when_restoring(tmp_path: Path) -> None
     second = make_rollout(3, scenario=str(changed))
     with pytest.raises(CheckpointError, match="does not repeat the episodes under way"):
         second.load_state_dict(arrays, values)
+
+
+def test_a_checkpoint_without_intended_actions_is_refused() -> None:
+    first = make_rollout(3)
+    list(episodes(first, 7))
+    arrays, values = first.state_dict()
+    old = {name: array for name, array in arrays.items() if name not in ("intents", "worst")}
+    with pytest.raises(CheckpointError, match="written by an earlier version"):
+        make_rollout(3).load_state_dict(old, values)
