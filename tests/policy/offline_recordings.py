@@ -17,7 +17,6 @@ from policy_pkg.train.learner_config import LearnerConfig
 from policy_pkg.train.rollout import Rollout
 from sim_pkg.env import make_env
 
-ROBOTS = ("robot_1", "robot_2", "robot_3")
 SIZES = Sizes(
     n_robots=3, n_actions=4, obs_size=5, state_size=6, episode_limit=7, stay_actions=(2, 0)
 )
