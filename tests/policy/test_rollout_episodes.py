@@ -14,7 +14,7 @@ import pytest
 
 from crash_coach_pkg.coach import Coach
 from crash_coach_pkg.config import CoachConfig, TeamSpec
-from crash_coach_pkg.plan import CrashPlan, Fault, Trigger, TriggerKind
+from crash_coach_pkg.plan import CrashPlan
 from policy_pkg.checkpoint import CheckpointError
 from policy_pkg.policy import RecurrentPolicy
 from policy_pkg.train.episode import Sizes
