@@ -83,6 +83,16 @@ def test_check_tells_damage_apart_from_gaps(
     assert f"problem: {path}: is cut off at byte" in done.stdout
 
 
+def test_repeated_and_disordered_messages_are_notes(tmp_path: Path, crash_coach: Verb) -> None:
+    team = Team()
+    sent = messages(played(team, 2))
+    folder = write(tmp_path / "bag", team, [*sent, *sent[:3]])
+    again = sum(one.topic.startswith("/robot") for one in sent[:3])
+    done = crash_coach("bags", "check", str(folder))
+    assert done.returncode == 0
+    assert f"note: {folder}: {again} messages say nothing new of a robot-step" in done.stdout
+
+
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [

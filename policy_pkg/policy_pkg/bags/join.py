@@ -38,15 +38,18 @@ class Pieces:
     def conflict(self, text: str) -> None:
         self.conflicts.setdefault(text)
 
-    def add_raw(self, kind: Kind, key: Key, robot: str, channel: Channel, data: bytes) -> None:
+    def add_raw(self, kind: Kind, key: Key, robot: str, channel: Channel, data: bytes) -> bool:
+        """Whether it is new."""
         known = self.raw[kind].setdefault(key, (channel, data))
         if known[1] is data:
             self.nbytes += len(data) + _OVERHEAD_BYTES
-        elif known[1] != data:
+            return True
+        if known[1] != data:
             self.conflict(
                 f"/{robot}/{kind.value}, step {key[0]}, comes twice with different content: "
                 "two sims, or a restarted one, in one bag"
             )
+        return False
 
     def add_state(self, state: Any, data: bytes) -> None:
         self.nbytes += len(data) + _OVERHEAD_BYTES
@@ -100,6 +103,9 @@ class Joiner:
         self.bag, self.scan = bag, scan
         self.decoder = Decoder()
         self.messages = 0  # on topics that the reader needs
+        self.repeated = 0  # of them, those that say nothing new of a robot-step
+        self.disordered = 0  # of them, those received before the one before them in the file
+        self._newest_ns = 0
         self.first_ns, self.last_ns = 0, 0
         self.about = scan.about
         self.met: set[Kind] = set()
@@ -151,16 +157,22 @@ class Joiner:
         try:
             if kind in OF_ROBOT:
                 number, step = key_of(entry.data)
-                pieces = self._pieces(number)
-                if pieces is not None:
-                    before = pieces.nbytes
-                    pieces.add_raw(kind, (step, robot), name, channel, entry.data)
-                    self._nbytes += pieces.nbytes - before
-                return pieces
+                return self._add_raw(kind, number, (step, robot), name, entry)
             return self._add_other(kind, self.decoder.decode(channel, entry.data), entry.data)
         except ValueError as error:
             self.problem(f"topic {channel.topic}: {error}")
             return None
+
+    def _add_raw(self, kind: Kind, number: int, key: Key, name: str, entry: Entry) -> Pieces | None:
+        pieces = self._pieces(number)
+        if pieces is None:
+            self.repeated += 1
+            return None
+        before = pieces.nbytes
+        if not pieces.add_raw(kind, key, name, entry.channel, entry.data):
+            self.repeated += 1
+        self._nbytes += pieces.nbytes - before
+        return pieces
 
     def _add_other(self, kind: Kind, message: Any, data: bytes) -> Pieces | None:
         if kind is Kind.EVENT and message.kind != EFFECT:
@@ -218,3 +230,5 @@ class Joiner:
         self.first_ns = min(self.first_ns, log_time_ns) if self.messages else log_time_ns
         self.last_ns = max(self.last_ns, log_time_ns)
         self.messages += 1
+        self.disordered += log_time_ns < self._newest_ns
+        self._newest_ns = log_time_ns

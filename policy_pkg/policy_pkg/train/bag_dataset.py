@@ -62,6 +62,8 @@ class BagSummary:
     robots: tuple[str, ...]
     about: About | None
     messages: int = 0
+    repeated: int = 0  # messages that say nothing new of a robot-step; harmless
+    disordered: int = 0  # messages received before the one before them in the file; harmless
     duration_s: float = 0.0
     episodes: int = 0
     steps: int = 0
@@ -131,6 +133,7 @@ class BagReading:
                 yield recorded
         summary.about = joiner.about
         summary.messages = joiner.messages
+        summary.repeated, summary.disordered = joiner.repeated, joiner.disordered
         summary.duration_s = (joiner.last_ns - joiner.first_ns) * 1e-9
         self._check_topics()
 

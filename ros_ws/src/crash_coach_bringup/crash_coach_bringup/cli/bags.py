@@ -65,6 +65,7 @@ def show(summary: BagSummary, problems: Sequence[Problem]) -> None:
         ("files", str(summary.files)),
         ("duration", f"{summary.duration_s:.1f} s"),
         ("messages", f"{summary.messages:,}"),
+        ("repeated, out of order", f"{summary.repeated:,}, {summary.disordered:,}"),
         ("complete episodes", f"{summary.episodes:,} ({summary.steps:,} steps)"),
         ("success (95 % interval)", success),
         ("episodes with crashes", f"{summary.crashed_episodes:,}"),
@@ -103,7 +104,8 @@ def check(
 ) -> None:
     """One line per problem; exit code 1 if there are any.
 
-    An incomplete episode, as where a recording was stopped, is told as a note.
+    An incomplete episode, as where a recording was stopped, is told as a note; so are messages
+    that come again or out of order, which cost nothing.
     """
     check_json_target(json)
     count, results = 0, []
@@ -117,6 +119,12 @@ def check(
         if drops:
             count += 1
             typer.echo(f"problem: {bag.name}: the recorder dropped {_counts(drops, '')}")
+        for number, what in (
+            (summary.repeated, "say nothing new of a robot-step"),
+            (summary.disordered, "are out of order"),
+        ):
+            if number:
+                typer.echo(f"note: {bag.name}: {number} messages {what}; nothing is lost by that")
         typer.echo(f"{bag.name}: {summary.episodes} complete episodes")
         results.append(as_json(summary, problems))
     write_json(json, {"bags": results, "problems": count})
