@@ -26,9 +26,9 @@ from sim_pkg.contract import UserError
 ARM_TIMEOUT_S = 2.0
 HEARTBEATS_PER_LEASE = 3
 IN_FORCE = "/coach/plan_in_force"
-# How long the first plan waits for the gate to say what is in force, and to be discovered at all.
+# How long the first plan waits for a gate to be discovered and to say what is in force. A gate
+# always says something, so that only a coach without one waits for so long.
 ADOPT_TIMEOUT_S = 1.0
-DISCOVERY_S = 0.3
 ENDLESS = Played(episode=0, ended=False, success=False)
 
 
@@ -115,10 +115,7 @@ class CoachLink(Node):
     def _may_settle(self) -> bool:
         if not self._waiting:
             return False
-        if self._told:
-            return True
-        gate = self.count_publishers(IN_FORCE) > 0
-        return time.monotonic() - self._started_s >= (ADOPT_TIMEOUT_S if gate else DISCOVERY_S)
+        return self._told or time.monotonic() - self._started_s >= ADOPT_TIMEOUT_S
 
     def _follow(self, played: Played) -> None:
         self.publish(self.control.follow(played.episode))
