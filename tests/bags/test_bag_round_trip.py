@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from policy_pkg.bags.writer import Split
 from policy_pkg.train.bag_dataset import RecordedEpisode, load_episodes
 from sim_pkg.contract import UserError
 
+EVENT = "crash_coach_interfaces/msg/FaultEvent"
 ARRAYS = ("obs", "state", "available", "actions", "reward", "faults")
 
 
@@ -97,6 +99,34 @@ def test_an_unfinished_file_gives_what_reached_it(tmp_path: Path) -> None:
     assert "cut off" in problems[0]
     with pytest.raises(UserError, match="cut off"):
         list(load_episodes([folder], strict=True))
+
+
+def test_in_real_time_a_command_serves_for_several_steps(tmp_path: Path) -> None:
+    team = Team(seed=4, p_fault=1.0)
+    (made,) = played(team, 1)
+    twice = (made.episode.faults[1:, 0] == 2) & (made.episode.faults[:-1, 0] == 2)
+    step = int(np.flatnonzero(twice)[0]) + 1
+    sent = [
+        one
+        for one in made.sent
+        if not (one.topic == "/robot_1/command" and step_of(one, "Action") == step)
+        and not (
+            one.topic == "/coach/events"
+            and STORE.deserialize_cdr(one.data, EVENT).robot == "robot_1"
+            and step_of(one, "FaultEvent") == step
+        )
+    ]
+    assert len(sent) == len(made.sent) - 2
+    about = replace(team.about, mode="realtime")
+    (got,) = load_episodes([write(tmp_path / "real", team, sent, about=about)], strict=True)
+    assert np.array_equal(got.episode.faults, made.episode.faults)
+    with pytest.raises(UserError, match=f"robot_1's step {step}"):
+        list(load_episodes([write(tmp_path / "lock", team, sent)], strict=True))
+
+
+def step_of(sent: Sent, msgtype: str) -> int:
+    message = STORE.deserialize_cdr(sent.data, f"crash_coach_interfaces/msg/{msgtype}")
+    return int(message.step)  # type: ignore[attr-defined]
 
 
 def test_several_bags_are_one_data_set(tmp_path: Path) -> None:

@@ -149,7 +149,9 @@ class BagReading:
                 recorded = None  # cut short before its first step
             else:
                 joined = assemble(pieces, robots, wanted, joiner.decoder, last)
-                recorded = _recorded(self.summary.name, robots, pieces, joined)
+                about = joiner.about
+                realtime = about is not None and about.mode == "realtime"
+                recorded = _recorded(self.summary.name, robots, pieces, joined, realtime)
         except IncompleteError as error:
             if not last:
                 return None
@@ -182,7 +184,7 @@ class BagReading:
 
 
 def _recorded(
-    name: str, robots: tuple[str, ...], pieces: Pieces, joined: Joined
+    name: str, robots: tuple[str, ...], pieces: Pieces, joined: Joined, realtime: bool
 ) -> RecordedEpisode:
     end = joined.end
     _check_hash(joined)
@@ -192,7 +194,7 @@ def _recorded(
         available=joined.available,
         actions=joined.executed,
         reward=joined.reward.astype(np.float32),
-        faults=_faults(joined, robots),
+        faults=_faults(joined, robots, realtime),
         terminated=bool(end.terminated),
     )
     return RecordedEpisode(
@@ -230,8 +232,11 @@ def _check_hash(joined: Joined) -> None:
         )
 
 
-def _faults(joined: Joined, robots: tuple[str, ...]) -> npt.NDArray[np.uint8]:
-    """(T, n) fault codes of the robot-steps that the sim marks as crashed."""
+def _faults(joined: Joined, robots: tuple[str, ...], realtime: bool) -> npt.NDArray[np.uint8]:
+    """(T, n) fault codes of the robot-steps that the sim marks as crashed.
+
+    In real time a faulted command may serve for several steps, so its code does too.
+    """
     codes = joined.codes.copy()
     for key, mode in {**joined.observed, **joined.modes}.items():
         code, (step, robot) = mode_code(mode), key
@@ -244,6 +249,10 @@ def _faults(joined: Joined, robots: tuple[str, ...]) -> npt.NDArray[np.uint8]:
                 f"{robots[robot]}, step {step}: fault code {codes[key]} in the command, "
                 f"{code} ({mode}) in the EFFECT"
             )
+    if realtime:
+        for step in range(1, len(codes)):
+            late = joined.crashed[step] & (codes[step] == 0)
+            codes[step, late] = codes[step - 1, late]
     unnamed = np.argwhere(joined.crashed & (codes == 0))
     if len(unnamed):
         step, robot = (int(value) for value in unnamed[0])
