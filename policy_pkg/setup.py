@@ -22,6 +22,7 @@ setup(
             "policy = policy_pkg.ros.policy_node:main",
             "recorder = policy_pkg.ros.recorder_node:main",
             "team = policy_pkg.ros.team_node:main",
+            "trainer = policy_pkg.ros.trainer_node:main",
         ],
     },
 )
