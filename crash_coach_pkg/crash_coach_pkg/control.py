@@ -11,6 +11,7 @@ from crash_coach_pkg.coach import BlockRecord, Coach, Planner
 from crash_coach_pkg.config import CoachConfig, TeamSpec
 from crash_coach_pkg.plan import NEXT_STEP, CrashPlan
 from crash_coach_pkg.strategies import Progress
+from sim_pkg.contract import UserError
 
 
 class ControlSettings(BaseModel):
@@ -39,6 +40,11 @@ class ControlSettings(BaseModel):
     )
     block_episodes: int = Field(
         default=32, ge=1, le=1_000_000, description="Adaptive: episodes per evaluation block."
+    )
+    success_from: Literal["episodes", "trainer"] = Field(
+        default="episodes",
+        description="Adaptive: where a block's success rate comes from: the last block_episodes "
+        "episodes, or /trainer/blocks, the evaluation blocks of live training.",
     )
     coach: CoachConfig = Field(default_factory=CoachConfig, description="Who crashes, and how.")
 
@@ -134,12 +140,27 @@ class Control:
         progress = self._progress()
         self._coach.count(self._plan)
         self._coach.advance(progress)
+        if self._settings.success_from == "trainer":
+            return None
         self._block.append(success)
         if len(self._block) < self._settings.block_episodes:
             return None
         rate = sum(self._block) / len(self._block)
         self._block.clear()
         return self._coach.record_block(rate, progress)
+
+    def evaluated(self, success_rate: float) -> BlockRecord | None:
+        """Call with a trainer's block; None where the strategy does not read it.
+
+        Raises:
+            UserError: a success rate outside [0, 1].
+        """
+        if not 0 <= success_rate <= 1:
+            raise UserError(f"success rate {success_rate} of a trainer's block is not in [0, 1]")
+        settings = self._settings
+        if settings.success_from != "trainer" or not settings.enabled or self._scenario is not None:
+            return None
+        return self._coach.record_block(success_rate, self._progress())
 
     def configure(self, settings: ControlSettings, now: bool) -> CrashPlan | None:
         """Takes new settings; with ``now``, returns a plan for what is left of the episode.

@@ -223,7 +223,9 @@ def _point(values: Mapping[str, Value]) -> tuple[float, ...]:
 
 
 # When they change, the running episode need not be planned again.
-NOT_IN_PLAN = frozenset(("apply_at", "lease_s", "block_episodes", "curriculum_episodes"))
+NOT_IN_PLAN = frozenset(
+    ("apply_at", "lease_s", "block_episodes", "curriculum_episodes", "success_from")
+)
 
 
 def counts_now(settings: ControlSettings, changed: Collection[str], endless: bool) -> bool:

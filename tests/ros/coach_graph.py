@@ -130,6 +130,7 @@ class Team:
             node.create_subscription(
                 Action, f"/{name}/command", partial(self._on_command, robot), NEWEST
             )
+        self._in_force = None
         node.create_subscription(FaultEvent, "/coach/events", self._on_event, EVENTS)
         node.create_subscription(CrashPlan, "/coach/plan", self.plans.append, PLAN)
 
@@ -160,9 +161,12 @@ class Team:
     def meet(self, gate: bool = True, coach: bool = True, follows: bool = True) -> None:
         """Waits until the processes under test have found this node, and it them.
 
-        ``follows``: the coach follows /sim.
+        ``follows``: the coach follows /sim. Without a gate this node says that no plan is in force.
         """
         n = self.node
+        if not gate:
+            self._in_force = n.create_publisher(CrashPlan, "/coach/plan_in_force", PLAN)
+            self._in_force.publish(CrashPlan())
 
         def met() -> bool:
             ready = True

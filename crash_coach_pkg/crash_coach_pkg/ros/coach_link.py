@@ -6,8 +6,8 @@ import threading
 import time
 from collections.abc import Callable
 
+from crash_coach_interfaces.msg import BlockResult, EpisodeState, FaultEvent
 from crash_coach_interfaces.msg import CrashPlan as CrashPlanMessage
-from crash_coach_interfaces.msg import EpisodeState, FaultEvent
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.node import Node
@@ -20,7 +20,7 @@ from crash_coach_pkg.ros.convert import (
     plan_from_message,
     played_from_bytes,
 )
-from crash_coach_pkg.ros.run import EPISODE, EVENTS, PLAN, TICK_S
+from crash_coach_pkg.ros.run import BLOCKS, EPISODE, EVENTS, PLAN, TICK_S
 from sim_pkg.contract import UserError
 
 ARM_TIMEOUT_S = 2.0
@@ -28,7 +28,7 @@ HEARTBEATS_PER_LEASE = 3
 IN_FORCE = "/coach/plan_in_force"
 # How long the first plan waits for a gate to be discovered and to say what is in force. A gate
 # always says something, so that only a coach without one waits for so long.
-ADOPT_TIMEOUT_S = 1.0
+ADOPT_TIMEOUT_S = 5.0
 ENDLESS = Played(episode=0, ended=False, success=False)
 
 
@@ -74,6 +74,7 @@ class CoachLink(Node):
                 EpisodeState, "/sim/boundary", self._on_episode, EPISODE, raw=True
             )
         self.create_subscription(FaultEvent, "/coach/events", self._on_event, EVENTS)
+        self.create_subscription(BlockResult, "/trainer/blocks", self._on_block, BLOCKS)
         self.create_timer(TICK_S, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def publish(self, plan: CrashPlan | None) -> None:
@@ -135,6 +136,16 @@ class CoachLink(Node):
                 return
             self._waiting.append(played)
             self.settle(at_once=False)
+
+    def _on_block(self, message: BlockResult) -> None:
+        with self.changed:
+            try:
+                record = self.control.evaluated(message.success_rate)
+            except UserError as error:
+                self.get_logger().error(f"{error}; ignored")
+                return
+        if record is not None:
+            self.get_logger().info(f"block {message.block} of the trainer: {record}")
 
     def _on_plan_in_force(self, message: CrashPlanMessage) -> None:
         with self.changed:

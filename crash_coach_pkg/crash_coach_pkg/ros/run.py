@@ -26,6 +26,7 @@ from sim_pkg.contract import UserError
 NEWEST = QoSProfile(depth=1)  # reliable: an observation or command replaces the one before
 PLAN = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 EVENTS = QoSProfile(depth=1000)  # on a busy machine readers may be that far behind
+BLOCKS = QoSProfile(depth=10)
 EPISODE = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 SPIN_S = 0.1  # how soon a signal is noticed
 TICK_S = 0.05  # steady timers for leases and heartbeats
