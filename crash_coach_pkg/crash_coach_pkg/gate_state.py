@@ -99,7 +99,11 @@ class GateState:
     def tick(self, now_s: float) -> Outputs:
         """Call often: ends the lease of a silent coach."""
         events = self.book.tick(now_s)
-        return (*events, *self._release(now_s)) if events else ()
+        if not events:
+            return ()
+        for stream in (*self._commands, *self._sights):
+            stream.expire()
+        return (*events, *self._release(now_s))
 
     def world(self, episode: int, step: int, world: World, now_s: float) -> Outputs:
         """Takes the team's state before ``step``, which conditions look at."""

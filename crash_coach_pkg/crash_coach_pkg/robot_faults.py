@@ -43,6 +43,11 @@ class RobotFaults:
         self.running, self.passed, self.seen = [], None, None
         self._term = self.team = None
 
+    def expire(self) -> None:
+        """The lease ran out: nothing is in force any more, as the team was told."""
+        self.running = []
+        self._term = self.team = None
+
     def follow(self, term: Term | None, step: int) -> list[Event]:
         """Goes over to ``term``; what ran under the one before ends, and is told where the new
         one has faults of its own (otherwise the whole team was told)."""

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+import numpy.typing as npt
 
 from sim_pkg.contract import BoolArray, FloatArray, IntArray
+
+_EXPLORATION = 0xE8910  # keeps these draws apart from the environment's of the same seed
 
 
 def greedy(q: FloatArray, available: BoolArray) -> IntArray:
@@ -37,7 +42,36 @@ def epsilon_greedy(
     q, available: (..., A). Takes the same number of draws from ``rng`` whatever the values are.
     """
     draws = rng.random((2, *q.shape[:-1]))
-    best = greedy(q, available)
+    return _mixed(greedy(q, available), available, epsilon, draws)
+
+
+@dataclass(frozen=True)
+class Exploration:
+    """Epsilon-greedy choices that are keyed by (seed, episode, step, robot): whoever acts, and in
+    whatever order, the same robot-step gets the same draw."""
+
+    epsilon: float
+    seed: int
+    team: int  # robots of the whole team
+
+    def choose(
+        self, best: IntArray, available: BoolArray, robots: IntArray, episode: int, step: int
+    ) -> IntArray:
+        """(R,) with probability ``epsilon`` a uniform available action, else that of ``best``.
+
+        robots: (R,) indexes in the team; available: (R, A).
+        """
+        if self.epsilon <= 0:
+            return best
+        key = np.array([self.seed ^ _EXPLORATION, episode], dtype=np.uint64)
+        rng = np.random.Generator(np.random.Philox(key=key, counter=[0, step, 0, 0]))
+        return _mixed(best, available, self.epsilon, rng.random((2, self.team))[:, robots])
+
+
+def _mixed(
+    best: IntArray, available: BoolArray, epsilon: float, draws: npt.NDArray[np.float64]
+) -> IntArray:
+    """draws: (2, ...) in [0, 1): whether to explore, and which available action then."""
     order = np.cumsum(available, axis=-1)
     pick = (draws[1] * order[..., -1]).astype(np.int64)
     uniform = np.argmax(order > pick[..., None], axis=-1)

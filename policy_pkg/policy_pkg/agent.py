@@ -29,6 +29,14 @@ class Policy(Protocol):
     ) -> tuple[FloatArray, FloatArray]: ...
 
 
+class Explorer(Protocol):
+    """What the agent needs of policy_pkg.act.Exploration."""
+
+    def choose(
+        self, best: IntArray, available: BoolArray, robots: IntArray, episode: int, step: int
+    ) -> IntArray: ...
+
+
 class ObservationError(UserError):
     """An observation that this policy cannot have been trained for."""
 
@@ -83,6 +91,8 @@ class Agent(Generic[Stamp]):
         self.robots = tuple(robots)
         self.gaps = 0
         """Observations whose predecessor was never seen: the recurrent state misses a step."""
+        self.exploration: Explorer | None = None
+        """Replaces some of the best actions; None: never."""
         self._policy = policy
         self._greedy = greedy
         self._worst = worst
@@ -174,8 +184,11 @@ class Agent(Generic[Stamp]):
             index = int(np.arange(len(self.robots))[rows][np.argmin(usable)])
             self._refuse(index)
         self._hidden[rows] = hidden
-        best, worst = self._greedy(q, available).tolist(), self._worst(q, available).tolist()
-        return list(zip(best, worst, strict=True))
+        best = self._greedy(q, available)
+        if self.exploration is not None:
+            episode, step = self._waiting_key
+            best = self.exploration.choose(best, available, self._index[rows], episode, step)
+        return list(zip(best.tolist(), self._worst(q, available).tolist(), strict=True))
 
     def _refuse(self, robot: int) -> None:
         name = self.robots[robot]

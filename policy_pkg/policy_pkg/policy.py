@@ -15,6 +15,7 @@ import numpy.typing as npt
 from sim_pkg.contract import FloatArray, IntArray
 
 ROW_MULTIPLE = 8
+WeightArrays = dict[str, npt.NDArray[np.float32]]
 
 WEIGHT_NAMES = (
     "fc1.weight",

@@ -42,7 +42,7 @@ def test_every_setting_is_a_parameter_with_a_description() -> None:
         "duration_steps", "max_crashed", "min_alive", "beta", "rho", "alpha_max", "seed",
         "apply_at", "lease_s", "resample", "cap_rule", "crashed_exactly", "block_episodes",
         "curriculum_episodes", "victim_role", "hazard_rate_hz", "near_point_m", "near_radius_m",
-        "return_above", *of_modes,
+        "return_above", "success_from", *of_modes,
     }  # fmt: skip
     for spec in parameter_specs():
         assert spec.description

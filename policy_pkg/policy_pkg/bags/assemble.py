@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from policy_pkg.bags.decode import Decoder
+from policy_pkg.bags.decode import Decodes
 from policy_pkg.bags.join import Key, Pieces
 from policy_pkg.bags.topics import Kind
 from sim_pkg.contract import BoolArray, FloatArray, IntArray
@@ -77,7 +77,7 @@ def counts_suffice(pieces: Pieces, n_robots: int, wanted: Wanted) -> bool:
 
 
 def assemble(
-    pieces: Pieces, robots: Sequence[str], wanted: Wanted, decoder: Decoder, last: bool
+    pieces: Pieces, robots: Sequence[str], wanted: Wanted, decoder: Decodes, last: bool
 ) -> Joined:
     """The episode. ``last``: nothing more will come, so what is not decisive may be missing.
 
@@ -144,7 +144,7 @@ def _states(pieces: Pieces, n: int) -> list[Any]:
 
 
 def _observations(
-    pieces: Pieces, kind: Kind, robots: Sequence[str], decoder: Decoder
+    pieces: Pieces, kind: Kind, robots: Sequence[str], decoder: Decodes
 ) -> tuple[FloatArray, BoolArray]:
     """(T+1, n, O) features and (T+1, n, A) availability."""
     steps, raw = pieces.end.step, pieces.raw[kind]
@@ -196,7 +196,7 @@ class _Decisions:
         self,
         pieces: Pieces,
         robots: Sequence[str],
-        decoder: Decoder,
+        decoder: Decodes,
         executed: IntArray,
         crashed: BoolArray,
     ) -> None:
@@ -207,7 +207,7 @@ class _Decisions:
         self._commands = self._decoded(Kind.COMMAND, decoder)
         self._intents = self._decoded(Kind.INTENT, decoder)
 
-    def _decoded(self, kind: Kind, decoder: Decoder) -> dict[Key, Any]:
+    def _decoded(self, kind: Kind, decoder: Decodes) -> dict[Key, Any]:
         raw = self._pieces.raw[kind]
         return {key: decoder.decode(*raw[key]) for key in self._keys if key in raw}
 

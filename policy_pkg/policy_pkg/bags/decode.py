@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from typing import Any
+from typing import Any, Protocol
 
 from rosbags.serde.errors import SerdeError
 from rosbags.typesys import (
@@ -37,6 +37,12 @@ _SAME = {Kind.SEEN: Kind.OBSERVATION, Kind.COMMAND: Kind.INTENT}
 _BROKEN = (
     struct.error, ValueError, IndexError, TypeError, OverflowError, MemoryError, SerdeError,
 )  # fmt: skip
+
+
+class Decodes(Protocol):
+    """What turns the messages of an episode's pieces into objects."""
+
+    def decode(self, channel: Channel, data: bytes) -> Any: ...
 
 
 class Decoder:

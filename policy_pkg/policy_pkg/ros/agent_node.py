@@ -18,6 +18,7 @@ from rclpy.exceptions import ParameterException
 from rclpy.experimental import EventsExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
@@ -25,6 +26,7 @@ from policy_pkg.act import greedy, worst
 from policy_pkg.agent import Agent
 from policy_pkg.checkpoint import CheckpointError, load_policy
 from policy_pkg.ros.convert import bytes_from_answer, sensed_from_bytes
+from policy_pkg.ros.weights_link import Receive, WeightsLink
 from sim_pkg.contract import UserError
 
 NEWEST = QoSProfile(depth=1)  # reliable: an observation or command replaces the one before
@@ -42,18 +44,24 @@ class AgentNode(Node):
     def __init__(self, name: str, one_robot: bool, context: Context | None = None) -> None:
         super().__init__(name, context=context)
         robot = self._text("robot", "robot that this policy drives") if one_robot else None
-        checkpoint = self._text("checkpoint", "run directory or checkpoint directory")
+        checkpoint = self._text("checkpoint", "run directory or checkpoint directory; see live")
+        live = self._flag("live", "act on the weights of a trainer instead of a checkpoint")
         command_topic = self._text("command_topic", "answers go to /<robot>/<this>", "command_raw")
         observation_topic = self._text(
             "observation_topic",
             "acts on /<robot>/<this>; observation_seen where the gate relays observations",
             "observation",
         )
-        self._check_parameters()
+        self._check_parameters({"checkpoint"} if live else set())
+        self._topics = (observation_topic, command_topic)
+        self._commands: list[Publisher] = []
         self.failure: UserError | None = None
         """Why the node has to end; an exception in a callback would be told with a traceback."""
+        if live:
+            self._link = WeightsLink(self, () if robot is None else (robot,), self._act_for)
+            return
         bundle = load_policy(checkpoint)
-        self.agent: Agent[bytes] = Agent(
+        agent: Agent[bytes] = Agent(
             bundle.policy,
             bundle.robots,
             bundle.robots if robot is None else (robot,),
@@ -62,11 +70,16 @@ class AgentNode(Node):
             greedy,
             worst,
         )
+        self._act_for(agent.robots, agent.receive)
+
+    def _act_for(self, robots: tuple[str, ...], receive: Receive) -> None:
+        """Opens the topics of ``robots``; ``receive`` answers their observations."""
+        observation_topic, command_topic = self._topics
+        self._receive = receive
         self._commands = [
-            self.create_publisher(Action, f"/{name}/{command_topic}", NEWEST)
-            for name in self.agent.robots
+            self.create_publisher(Action, f"/{name}/{command_topic}", NEWEST) for name in robots
         ]
-        for index, name in enumerate(self.agent.robots):
+        for index, name in enumerate(robots):
             self.create_subscription(
                 Observation,
                 f"/{name}/{observation_topic}",
@@ -81,18 +94,27 @@ class AgentNode(Node):
         ).value
         return value
 
-    def _check_parameters(self) -> None:
+    def _flag(self, name: str, description: str) -> bool:
+        value: bool = self.declare_parameter(
+            name, False, ParameterDescriptor(description=description, read_only=True)
+        ).value
+        return value
+
+    def _check_parameters(self, excess: set[str]) -> None:
+        """``excess``: those that have no meaning here and have to be empty."""
         known = ", ".join(sorted(self._parameters))
         for name in self._parameter_overrides:
             if not self.has_parameter(name):
                 raise UserError(f"unknown parameter {name!r} of {self.get_name()}; known: {known}")
         for name, parameter in self._parameters.items():
-            if parameter.value == "":
+            if name in excess and parameter.value != "":
+                raise UserError(f"parameter {name!r} of {self.get_name()} has no meaning with live")
+            if parameter.value == "" and name not in excess:
                 raise UserError(f"parameter {name!r} of {self.get_name()} is missing")
 
     def _on_observation(self, robot: int, message: bytes) -> None:
         try:
-            answers = self.agent.receive(robot, sensed_from_bytes(message))
+            answers = self._receive(robot, sensed_from_bytes(message))
         except UserError as error:
             self.failure = error
             return

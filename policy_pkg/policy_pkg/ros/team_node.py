@@ -8,7 +8,10 @@ from policy_pkg.ros.agent_node import AgentNode, spin
 
 
 class TeamNode(AgentNode):
-    """Parameters: checkpoint, command_topic, observation_topic; the checkpoint names the robots."""
+    """Parameters: checkpoint or live, command_topic, observation_topic.
+
+    The checkpoint, or the trainer's weights, name the robots.
+    """
 
     def __init__(self) -> None:
         super().__init__("team", one_robot=False)

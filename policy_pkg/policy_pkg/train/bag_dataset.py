@@ -151,7 +151,7 @@ class BagReading:
                 joined = assemble(pieces, robots, wanted, joiner.decoder, last)
                 about = joiner.about
                 realtime = about is not None and about.mode == "realtime"
-                recorded = _recorded(self.summary.name, robots, pieces, joined, realtime)
+                recorded = recorded_episode(self.summary.name, robots, pieces, joined, realtime)
         except IncompleteError as error:
             if not last:
                 return None
@@ -183,9 +183,15 @@ class BagReading:
                 self._joiner.problem(f"missing topic: no message on {topic}")
 
 
-def _recorded(
+def recorded_episode(
     name: str, robots: tuple[str, ...], pieces: Pieces, joined: Joined, realtime: bool
 ) -> RecordedEpisode:
+    """The episode, held against its trajectory hash.
+
+    Raises:
+        ContradictionError, IncompleteError: what is wrong, or missing.
+        ValueError: a plan or fault that does not exist.
+    """
     end = joined.end
     _check_hash(joined)
     episode = Episode(

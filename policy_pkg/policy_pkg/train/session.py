@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from crash_coach_pkg.action_tools import ACTION_OFFERS
-from crash_coach_pkg.coach import Coach
+from crash_coach_pkg.coach import BlockRecord, Coach
 from crash_coach_pkg.config import TeamSpec
 from crash_coach_pkg.faults import unmet_needs
 from crash_coach_pkg.strategies import Progress
@@ -24,7 +24,7 @@ from sim_pkg.contract import BatchEnv, UserError
 
 TEST_ARENAS = 32
 _TEST_KEY = 0x7E57
-_EXPLORATION, _SAMPLING = 1, 2  # streams of the run's seed
+EXPLORATION, SAMPLING = 1, 2  # streams of the run's seed
 
 TRAIN_MEANS = ("train_success_rate", "train_return_mean", "train_steps_mean")
 LEARNER_MEANS = ("loss", "grad_norm", "td_error_abs", "q_taken_mean", "target_mean")
@@ -43,6 +43,14 @@ class Counters:
     def to_json(self) -> dict[str, int | float]:
         return asdict(self)
 
+    def block_due(self, total_steps: int) -> bool:
+        """At step 0, whenever a multiple of the interval is passed, and at the end."""
+        return self.env_steps >= min(self.next_block_steps, total_steps)
+
+    def close_block(self, interval_steps: int) -> None:
+        self.blocks += 1
+        self.next_block_steps = (self.env_steps // interval_steps + 1) * interval_steps
+
 
 def generator(seed: int, stream: int) -> np.random.Generator:
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, stream])))
@@ -54,6 +62,40 @@ class Block:
 
     crashed: Evaluation  # crashes drawn at the coach's rate
     crash_free: Evaluation | None  # the same episodes without crashes
+
+
+def block_line(
+    config: TrainConfig,
+    done: Counters,
+    updates: int,
+    record: BlockRecord,
+    block: Block,
+    means: dict[str, float | None],
+    reports_success: bool,
+) -> dict[str, Value]:
+    """A block's line of metrics; see policy_pkg.train.metrics. Changes ``means``."""
+    if not reports_success:
+        means["train_success_rate"] = None
+    summary, free = block.crashed.summary(), block.crash_free
+    return {
+        "env_steps": done.env_steps,
+        "episodes": done.episodes,
+        "gradient_steps": updates,
+        "epsilon": config.epsilon(done.env_steps),
+        "alpha": record.rate,
+        "cap": record.cap,
+        "crashed_fraction": record.crashed_fraction,
+        "success_rate": record.success_rate if reports_success else None,
+        "return_mean": summary["return_mean"],
+        "steps_mean": summary["steps_mean"],
+        "block_crashed": summary["crashed_fraction"],
+        "decision": record.decision,
+        "new_alpha": record.new_rate,
+        "success_crash_free": free.success_rate if free and reports_success else None,
+        "return_crash_free": free.return_mean if free else None,
+        **means,
+        "updates_per_episode": config.updates_per_episode,
+    }
 
 
 @dataclass
@@ -92,8 +134,8 @@ class Session:
         self.learner = Learner(config.learner, sizes, config.seed)
         self.policy = RecurrentPolicy(self.learner.agent_weights(), spec.n_robots, spec.n_actions)
         self.replay = Replay(config.replay_episodes, sizes)
-        self.sampling = generator(config.seed, _SAMPLING)
-        exploration = generator(config.seed, _EXPLORATION)
+        self.sampling = generator(config.seed, SAMPLING)
+        exploration = generator(config.seed, EXPLORATION)
         self.rollout = Rollout(self.env, self.policy, self.coach.plan, config.seed, exploration)
 
     @property
@@ -107,9 +149,7 @@ class Session:
 
     @property
     def block_due(self) -> bool:
-        """At step 0, whenever a multiple of the interval is passed, and at the end."""
-        done = self.counters
-        return done.env_steps >= min(done.next_block_steps, self.config.total_steps)
+        return self.counters.block_due(self.config.total_steps)
 
     def collect(self) -> None:
         """One step in every arena; learns after each episode that it ended, as PyMARL does.
@@ -169,35 +209,12 @@ class Session:
 
     def end_block(self, block: Block) -> dict[str, Value]:
         """Tells the coach e_t; returns the block's line of metrics."""
-        done, spec = self.counters, self.env.spec
+        done, config = self.counters, self.config
         record = self.coach.record_block(block.crashed.success_rate, self.progress)
-        interval = self.config.test_interval_steps
-        done.blocks += 1
-        done.next_block_steps = (done.env_steps // interval + 1) * interval
+        done.close_block(config.test_interval_steps)
         means = self.means.take(TRAIN_MEANS + LEARNER_MEANS)
-        if not spec.reports_success:
-            means["train_success_rate"] = None
-        summary = block.crashed.summary()
-        free = block.crash_free
-        return {
-            "env_steps": done.env_steps,
-            "episodes": done.episodes,
-            "gradient_steps": self.learner.updates,
-            "epsilon": self.config.epsilon(done.env_steps),
-            "alpha": record.rate,
-            "cap": record.cap,
-            "crashed_fraction": record.crashed_fraction,
-            "success_rate": record.success_rate if spec.reports_success else None,
-            "return_mean": summary["return_mean"],
-            "steps_mean": summary["steps_mean"],
-            "block_crashed": summary["crashed_fraction"],
-            "decision": record.decision,
-            "new_alpha": record.new_rate,
-            "success_crash_free": free.success_rate if free and spec.reports_success else None,
-            "return_crash_free": free.return_mean if free else None,
-            **means,
-            "updates_per_episode": self.config.updates_per_episode,
-        }
+        updates, reports_success = self.learner.updates, self.env.spec.reports_success
+        return block_line(config, done, updates, record, block, means, reports_success)
 
     def state_dict(self) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
         """Tensor files by stem, and JSON values."""
