@@ -22,6 +22,16 @@ WORST = 3
 Key = tuple[int, int, int]
 
 
+def delayed(entered: list[int], steps: int, key: Key) -> int:
+    """The action that arrives at the last of the steps ``entered``, or WITHHELD."""
+    arrived: list[list[int]] = [[] for _ in entered]
+    for sent in entered:
+        late = [place for place, now in enumerate(entered) if now >= sent + steps]
+        if late:
+            arrived[late[0]].append(sent)
+    return ACTIONS[(arrived[-1][-1] + key[2]) % 4] if arrived[-1] else WITHHELD
+
+
 @dataclass
 class Run:
     """Plays coach, sim and policies against a gate and keeps what the gate says."""
@@ -145,6 +155,13 @@ class Run:
         self, oracle: Oracle, fault: Fault, since: int, key: Key, action: int
     ) -> tuple[int, ...]:
         """What may be passed on."""
+        begun = max(since, oracle.first)
+        # A fault sees the commands of the steps in which no later one of the plan counts instead.
+        entered = [
+            step
+            for step in range(begun, key[1] + 1)
+            if oracle.in_force(key[2], step, observation=False) == (fault, since)
+        ]
         match fault.mode:
             case "mute":
                 return (WITHHELD,)
@@ -155,15 +172,12 @@ class Run:
             case "drop":
                 return (WITHHELD, action)
             case "delay":
-                # Another plan with a delay may have begun anew in between, with nothing under way.
-                begun = max(since, oracle.first)
-                old = key[1] - int(fault.parameters[0][1])
-                sent = ACTIONS[(old + key[2]) % 4]
-                return (sent if old >= begun and AVAILABLE[sent] else WITHHELD,)
+                action = delayed(entered, int(fault.parameters[0][1]), key)
+                return (action if action != WITHHELD and AVAILABLE[action] else WITHHELD,)
         frozen = [
             d.applied
             for k, d in self.decided.items()
-            if k[0] == key[0] and k[2] == key[2] and k[1] < max(since, oracle.first)
+            if k[0] == key[0] and k[2] == key[2] and k[1] < entered[0]
         ]
         passed = [a for a in frozen if a != WITHHELD]
         return (passed[-1] if passed and AVAILABLE[passed[-1]] else WITHHELD,)

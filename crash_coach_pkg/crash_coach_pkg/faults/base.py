@@ -1,7 +1,8 @@
 """What a fault is: one robot's faulted stretch of commands or of observations.
 
 A mode is a class with a name, a code, a parameter schema and one method; an object of it lives as
-long as the stretch. It sees the robot's commands (or observations) in order, each step once, and
+long as the stretch. It sees the robot's commands (or observations) in order, each step once, but
+not those of steps in which a later fault of the plan counts instead, and
 everything random in it comes from ``Step.bits``: the same plan gives the same effects whatever the
 timing. docs/adding_a_fault.md walks through a mode of your own.
 """
