@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Iterator
-from functools import partial
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from rosgraph_msgs.msg import Clock
 from sim_driver import LEFT, RIGHT, STAY, UP, Driver, Env, end_of, sim
-from std_srvs.srv import SetBool
 from visualization_msgs.msg import Marker, MarkerArray
 
 from sim_pkg.contract import BoolArray
@@ -193,31 +191,6 @@ def test_reset_starts_each_episode_without_autostart(ros_env: Env, driver: Drive
         driver.until(lambda: len(driver.ends()) == 2)
         assert end_of(process)[0] == 0
     assert driver.ends()[1].trajectory_hash == core_hash(1, 0)[0]
-
-
-def test_pause_and_single_steps(ros_env: Env, driver: Driver) -> None:
-    with sim(ros_env, max_resends=1000) as process:
-        driver.until(lambda: len(driver.states) > 3)
-        assert not driver.trigger("/sim/step").success
-        assert driver.call("/sim/pause", SetBool, SetBool.Request(data=True)).success
-        driver.spin(0.3)
-        before = len(driver.states)
-
-        def grown(count: int) -> bool:
-            return len(driver.states) >= count
-
-        driver.spin(0.5)
-        assert len(driver.states) == before
-        for extra in (1, 2, 3):
-            assert driver.trigger("/sim/step").success
-            driver.until(partial(grown, before + extra))
-            driver.spin(0.2)
-            # A step that ends an episode also shows the next one's start.
-            new = driver.states[before:]
-            assert sum(1 for s in new if s.step > 0) == extra
-        assert driver.call("/sim/pause", SetBool, SetBool.Request(data=False)).success
-        driver.until(lambda: len(driver.states) > before + 10)
-        assert process.poll() is None
 
 
 def test_odometry_and_markers_for_who_listens(ros_env: Env, driver: Driver) -> None:

@@ -21,6 +21,7 @@ from sim_pkg.config import ConfigError
 from sim_pkg.contract import UserError
 from sim_pkg.env import make_env
 from sim_pkg.lockstep import Decisions
+from sim_pkg.pause import Pause
 from sim_pkg.realtime import NewestCommands
 from sim_pkg.ros import convert
 from sim_pkg.ros.sim_lock import SecondSimError, only_sim
@@ -55,12 +56,10 @@ class SimNode(Node):
         self._session = Session(env, params.seed, params.first_episode)
         self._lockstep = params.mode == "lockstep"
         self._decisions = Decisions(env.spec.robots)
-        self._newest = NewestCommands(
-            env.spec.robots, params.cmd_timeout_s or 3 * env.spec.dt_s / params.real_time_factor
-        )
+        period_s = env.spec.dt_s / params.real_time_factor
+        self._newest = NewestCommands(env.spec.robots, params.cmd_timeout_s or 3 * period_s)
         self._phase = _Phase.MATCHING
-        self._paused = False
-        self._step_permits = 0
+        self._pause = Pause(period_s, time.monotonic)
         self._robot_indexes = {name: i for i, name in enumerate(env.spec.robots)}
         self._topics = SimTopics(self, env.spec, params.seed, self._on_command, self._on_event)
         self.create_service(Trigger, "/sim/reset", self._on_reset)
@@ -73,7 +72,7 @@ class SimNode(Node):
         if self._lockstep:
             self._every(params.resend_after_s / 2, self._resend)
         else:
-            self._every(env.spec.dt_s / params.real_time_factor, self._tick)
+            self._every(period_s, self._tick)
 
     @property
     def done(self) -> bool:
@@ -138,7 +137,7 @@ class SimNode(Node):
                 message.step,
                 message.action,
                 message.fault,
-                time.monotonic(),
+                self._pause.now_s(),
             )
             return
         try:
@@ -156,32 +155,23 @@ class SimNode(Node):
         if robot is None or not convert.is_mute(event):
             return
         if not self._lockstep:
-            self._newest.mute(robot, event.episode, time.monotonic())
+            self._newest.mute(robot, event.episode, self._pause.now_s())
         elif self._decisions.mute(robot, event.episode, event.step):
             self._advance_if_complete()
 
     def _advance_if_complete(self) -> None:
-        if self._decisions.complete and self._may_step():
+        if self._decisions.complete and self._pause.may_step():
             self._advance(self._decisions)
 
     def _tick(self) -> None:
         """Real time: a control step is due."""
-        if self._phase is not _Phase.RUNNING or not self._may_step():
+        if self._phase is not _Phase.RUNNING or not self._pause.may_step():
             return
         session = self._session
-        refused = self._newest.sample(session.stay(), session.available, time.monotonic())
+        refused = self._newest.sample(session.stay(), session.available, self._pause.now_s())
         for text in refused:
             self.get_logger().warning(f"refused: {text}")
         self._advance(self._newest)
-
-    def _may_step(self) -> bool:
-        """Not paused, or one step was granted (and is now used up)."""
-        if not self._paused:
-            return True
-        if self._step_permits == 0:
-            return False
-        self._step_permits -= 1
-        return True
 
     def _advance(self, decided: Decisions | NewestCommands) -> None:
         self._session.advance(decided.actions, decided.crashed)
@@ -232,7 +222,7 @@ class SimNode(Node):
         if self._phase in (_Phase.MATCHING, _Phase.DONE):
             response.message = f"cannot reset: {self._phase.value}"
             return response
-        self._step_permits = 0
+        self._pause.forget()
         if self._session.running:
             self._session.cut()
             self._close_episode()
@@ -244,20 +234,19 @@ class SimNode(Node):
         return response
 
     def _on_step(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if not self._paused or self._phase is not _Phase.RUNNING:
+        if not self._pause.on or self._phase is not _Phase.RUNNING:
             state = self._phase.value if self._phase is not _Phase.RUNNING else "not paused"
             response.message = f"cannot step: {state}"
             return response
         response.success = True
         response.message = f"step {self._session.step} of episode {self._session.episode}"
-        self._step_permits += 1
+        self._pause.grant()
         if self._lockstep:
             self._advance_if_complete()
         return response
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self._paused = request.data
-        self._step_permits = 0
+        self._pause.set(request.data)
         response.success = True
         response.message = "paused" if request.data else "running on"
         if not request.data and self._lockstep:
