@@ -129,7 +129,10 @@ class PlanBook:
         self._known = False  # a plan was accepted, and its lease has not run out
         self._expired = False
         self._deadline_s: float | None = None
+        self._accepted: CrashPlan | None = None  # the newest
         self._refused: int | None = None
+        self.refusal = ""
+        """Why the newest plan is not carried out; empty where it is."""
 
     def plan(self, plan: CrashPlan, lease_s: float, now_s: float) -> tuple[Event, ...]:
         """Takes a plan or its heartbeat (the same revision again).
@@ -151,7 +154,8 @@ class PlanBook:
         reason = self._refuse(plan)
         if reason:
             return self.refused(plan.episode, plan.revision, reason)
-        self._known, self._expired, self._refused = True, False, None
+        self._known, self._expired = True, False
+        self._accepted, self._refused, self.refusal = plan, None, ""
         self.revision, self.lease_s = plan.revision, lease_s
         self._deadline_s = now_s + lease_s
         return self._arm(plan)
@@ -160,7 +164,7 @@ class PlanBook:
         """Notes a revision that cannot be carried out; the event comes once."""
         if revision == self._refused:
             return ()
-        self._refused = revision
+        self._refused, self.refusal = revision, reason
         return (Event(EventKind.REFUSED, episode, self.next_step, revision, detail=reason),)
 
     def _arm(self, plan: CrashPlan) -> tuple[Event, ...]:
@@ -226,8 +230,11 @@ class PlanBook:
     @property
     def in_force(self) -> CrashPlan:
         """The newest plan that was accepted, start steps resolved; without faults after a lease
-        ran out, or where there was none yet."""
+        ran out (a coach that starts then goes on from its rate), or where there was none yet."""
         newest = self.pending or (self.terms[-1] if self.terms else None)
-        if newest is None:
-            return CrashPlan(max(self.episode, 0), self.revision, 0, 0.0, 0)
-        return replace(newest.plan, revision=newest.revision)
+        if newest is not None:
+            return replace(newest.plan, revision=newest.revision)
+        episode = max(self.episode, 0)
+        if self._accepted is None:
+            return CrashPlan(episode, self.revision, seed=0, rate=0.0, cap=0)
+        return replace(self._accepted, episode=episode, cap=0, faults=())

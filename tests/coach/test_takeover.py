@@ -91,6 +91,24 @@ def test_no_robot_step_is_treated_differently(fault: dict[str, Any], takeover: i
     assert armed == [0, takeover]
 
 
+def test_the_rate_goes_on_after_a_lease_ran_out() -> None:
+    gate = GateState(TEAM.n, lockstep=True, first_lease_s=10.0)
+    adaptive = ControlSettings(coach=CoachConfig(strategy="adaptive", rho=0.5), block_episodes=1)
+    first = Control(adaptive, TEAM, 100)
+    for episode in range(2):
+        plan = first.follow(episode)
+        assert plan is not None
+        gate.plan(plan, 1.0, 0.0)
+        gate.command(Command(0, episode, 0, 1), 0.0)
+        first.finish(True)
+    gate.tick(2.0)
+    second = Control(adaptive, TEAM, 50)
+    adopted = second.adopt(gate.book.in_force)
+    assert adopted is not None
+    assert (adopted.faults, adopted.episode, adopted.rate) == ((), 1, 0.5)
+    assert second.rate == 0.5
+
+
 def test_what_a_lease_cleared_stays_cleared_until_the_next_episode() -> None:
     gate = GateState(TEAM.n, lockstep=True, first_lease_s=10.0)
     first = new_coach(100, {"crash_rate": 1.0}).follow(0)

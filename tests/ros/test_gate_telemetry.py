@@ -183,6 +183,12 @@ def test_plans_that_cannot_be_carried_out_are_refused_once(ros_env: dict[str, st
             refused = [e for e in t.events if e.revision == revision]
             assert [e.kind for e in refused] == [FaultEvent.REFUSED]
             assert reason in refused[0].detail
+        listener = Listener(t)
+        listener.status(
+            0, lambda s: "plan refused: " in s.message and reason in s.message, "the refusal"
+        )
+        publisher.publish(plan(99))
+        listener.status(0, lambda s: "refused" not in s.message, "its end")
         assert not any(outcome.faulted for outcome in t.step(0, 0))
 
 

@@ -97,7 +97,6 @@ class GateBase(Node):
         )
         self.health = TeamHealth(len(self.robots), cmd_timeout_s)
         self._gate: Gate | None = None
-        self._unreadable: int | None = None  # revision of the plan that was refused last
         self._outputs: list[tuple[int, WatchedPublisher]] = []
         self._events = self.create_publisher(FaultEvent, "/coach/events", EVENTS)
         self._in_force = self.create_publisher(CrashPlanMessage, "/coach/plan_in_force", PLAN)
@@ -177,12 +176,8 @@ class GateBase(Node):
         try:
             plan = plan_from_message(message, self.robots)
         except UserError as error:
-            if message.revision != self._unreadable:  # not again with every heartbeat
-                self._unreadable = message.revision
-                kind, step = EventKind.REFUSED, self._gate.book.next_step
-                self.send_events(
-                    [Event(kind, message.episode, step, message.revision, detail=str(error))]
-                )
+            book = self._gate.book
+            self.send_events(book.refused(message.episode, message.revision, str(error)))
             return
         self._gate.plan(plan, message.lease_s, time.monotonic())
 
@@ -200,7 +195,9 @@ class GateBase(Node):
         self._diagnostics.publish(message)
 
     def _status(self, gate: Gate, report: Report) -> DiagnosticStatus:
-        warning = gate.warning(report.robot)
+        refusal = gate.book.refusal
+        warnings = [gate.warning(report.robot), f"plan refused: {refusal}" if refusal else ""]
+        warning = "; ".join(text for text in warnings if text)
         level, values = _LEVELS[report.state], dict(report.values)
         if level == DiagnosticStatus.OK and (warning or "intruders" in values):
             level = DiagnosticStatus.WARN
