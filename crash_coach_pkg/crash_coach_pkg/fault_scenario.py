@@ -17,7 +17,15 @@ from crash_coach_pkg.expectations import Expectation
 from crash_coach_pkg.faults import unmet_needs
 from crash_coach_pkg.faults.base import Need
 from crash_coach_pkg.plan import CrashPlan, Fault
-from sim_pkg.config import ConfigError, StrictModel, YamlTree, did_you_mean, load_tree, validate
+from sim_pkg.config import (
+    ConfigError,
+    StrictModel,
+    YamlTree,
+    find_shipped,
+    load_tree,
+    shipped_names,
+    validate,
+)
 from sim_pkg.contract import UserError
 
 FAULTS_DIR = Path(__file__).parent / "configs" / "faults"
@@ -147,7 +155,7 @@ def load_fault_scenario(path: Path) -> FaultScenario:
 
 def fault_scenario_names() -> tuple[str, ...]:
     """The shipped files, sorted."""
-    return tuple(sorted(path.stem for path in FAULTS_DIR.glob("*.yaml")))
+    return shipped_names(FAULTS_DIR)
 
 
 def find_fault_scenario(name: str) -> Path:
@@ -156,18 +164,7 @@ def find_fault_scenario(name: str) -> Path:
     Raises:
         ConfigError: neither a known name nor an existing file.
     """
-    known = fault_scenario_names()
-    if name in known:
-        return FAULTS_DIR / f"{name}.yaml"
-    path = Path(name)
-    if path.suffix in {".yaml", ".yml"}:
-        if path.is_file():
-            return path
-        raise ConfigError(f"no fault scenario file {name!r}")
-    raise ConfigError(
-        f"unknown fault scenario {name!r}{did_you_mean(name, known)}; known: {', '.join(known)}, "
-        "or the path of a .yaml file"
-    )
+    return find_shipped("fault scenario", FAULTS_DIR, name)
 
 
 class ScenarioPlanner:

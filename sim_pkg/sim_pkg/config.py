@@ -202,8 +202,7 @@ def _inner_model(kind: Any) -> type[BaseModel] | None:
 
 def scenario_names() -> tuple[str, ...]:
     """Names of the shipped scenarios, sorted; ``skirmish/3m`` for a file in a folder."""
-    files = SCENARIOS_DIR.rglob("*.yaml")
-    return tuple(sorted(f.relative_to(SCENARIOS_DIR).with_suffix("").as_posix() for f in files))
+    return shipped_names(SCENARIOS_DIR)
 
 
 def find_scenario(scenario: str | Path) -> Path:
@@ -212,15 +211,30 @@ def find_scenario(scenario: str | Path) -> Path:
     Raises:
         ConfigError: neither a known name nor an existing file.
     """
-    known = scenario_names()
-    if isinstance(scenario, str) and scenario in known:
-        return SCENARIOS_DIR / f"{scenario}.yaml"
-    path = Path(scenario)
+    return find_shipped("scenario", SCENARIOS_DIR, scenario)
+
+
+def shipped_names(folder: Path) -> tuple[str, ...]:
+    """Names of the YAML files below ``folder``, sorted, without their ending."""
+    files = folder.rglob("*.yaml")
+    return tuple(sorted(f.relative_to(folder).with_suffix("").as_posix() for f in files))
+
+
+def find_shipped(what: str, folder: Path, name: str | Path) -> Path:
+    """The file of a name in ``folder``, or of a path. ``what``: the word for it in errors.
+
+    Raises:
+        ConfigError: neither a known name nor an existing file.
+    """
+    known = shipped_names(folder)
+    if isinstance(name, str) and name in known:
+        return folder / f"{name}.yaml"
+    path = Path(name)
     if path.suffix in {".yaml", ".yml"}:
         if path.is_file():
             return path
-        raise ConfigError(f"no scenario file {str(scenario)!r}")
+        raise ConfigError(f"no {what} file {str(name)!r}")
     raise ConfigError(
-        f"unknown scenario {str(scenario)!r}{did_you_mean(str(scenario), known)}; "
+        f"unknown {what} {str(name)!r}{did_you_mean(str(name), known)}; "
         f"known: {', '.join(known)}, or the path of a .yaml file"
     )

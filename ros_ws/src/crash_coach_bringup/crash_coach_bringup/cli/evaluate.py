@@ -44,6 +44,15 @@ class Layout(StrEnum):
     single = "single"
 
 
+ViaOption = Annotated[
+    Via, typer.Option(help="In this process, or as a real ROS graph in lock-step.")
+]
+LayoutOption = Annotated[
+    Layout,
+    typer.Option(help="With ROS: a process per node, one for the team, or a single process."),
+]
+
+
 def evaluator(
     target: Target, via: Via, layout: Layout
 ) -> Callable[[Condition, int, int], Evaluation]:
@@ -109,13 +118,8 @@ def evaluate(
     ] = None,
     mode: ModeOption = "stay",
     param: ParamOption = None,
-    via: Annotated[
-        Via, typer.Option(help="In this process, or as a real ROS graph in lock-step.")
-    ] = Via.core,
-    layout: Annotated[
-        Layout,
-        typer.Option(help="With ROS: a process per node, one for the team, or a single process."),
-    ] = Layout.nodes,
+    via: ViaOption = Via.core,
+    layout: LayoutOption = Layout.nodes,
     seed: Annotated[
         int, typer.Option(help="Seed of episodes, victims, random actions.", min=0)
     ] = 0,

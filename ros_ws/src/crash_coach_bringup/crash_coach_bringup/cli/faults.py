@@ -10,7 +10,13 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
-from crash_coach_bringup.cli.evaluate import MOST_EPISODES, Layout, Via
+from crash_coach_bringup.cli.evaluate import (
+    MOST_EPISODES,
+    Layout,
+    LayoutOption,
+    Via,
+    ViaOption,
+)
 from crash_coach_bringup.cli.faults_docs import generated, update
 from crash_coach_bringup.cli.faults_play import check_scenario, play
 from crash_coach_bringup.cli.faults_report import Played, check_target, measured, write
@@ -57,13 +63,8 @@ def run_verb(
     scenario: ScenarioOption = None,
     episodes: Annotated[int, typer.Option(help="Pairs.", min=1, max=MOST_EPISODES)] = 64,
     seed: Annotated[int, typer.Option(help="Seed of episodes and faults.", min=0)] = 0,
-    via: Annotated[
-        Via, typer.Option(help="In this process, or as a real ROS graph in lock-step.")
-    ] = Via.core,
-    layout: Annotated[
-        Layout,
-        typer.Option(help="With ROS: a process per node, one for the team, or a single process."),
-    ] = Layout.nodes,
+    via: ViaOption = Via.core,
+    layout: LayoutOption = Layout.nodes,
     out: Annotated[
         Path | None, typer.Option(help="Folder for the report, JUnit XML, effect log, figures.")
     ] = None,
