@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 from crash_coach_pkg.bits import random_bits
@@ -10,6 +11,9 @@ from sim_pkg.contract import FloatArray
 
 _HAZARD_STREAM = 1000  # + the fault's place in the plan
 _NEVER = -1
+# Most steps that are made up for where a command skips some; a step number may be anything up to
+# 2^32, and a step of hazards takes 0.1 ms.
+MOST_SKIPPED = 10_000
 
 
 class World(NamedTuple):
@@ -32,6 +36,7 @@ class Schedule:
         self._since = [_NEVER] * len(plan.faults)
         self._fired = [False] * len(plan.faults)
         self.needs_world = any(fault.trigger.needs_world for fault in plan.faults)
+        self._hazards = any(fault.trigger.kind == TriggerKind.HAZARD for fault in plan.faults)
         self.in_force: dict[int, int] = {}
         """Of the faults in force at the step last entered: place in the plan -> first step.
 
@@ -44,7 +49,8 @@ class Schedule:
         return self._next - 1
 
     def enter(self, step: int, world: World | None) -> None:
-        """Goes on to ``step``; steps that were skipped count for hazards and durations.
+        """Goes on to ``step``; steps that were skipped count for hazards and durations (hazards:
+        the last MOST_SKIPPED of them).
 
         Raises:
             ValueError: a step that was entered before, or conditions without a world.
@@ -53,7 +59,9 @@ class Schedule:
             raise ValueError(f"step {step} comes after step {self._next - 1}")
         if self.needs_world and world is None:
             raise ValueError(f"step {step}: the plan has conditions, but there is no world")
-        for passed in range(self._next, step + 1):
+        # Start steps and durations need nothing of the steps between.
+        first = max(self._next, step - MOST_SKIPPED) if self._hazards else step
+        for passed in range(first, step + 1):
             self._pass(passed, world if passed == step else None)
         self._next = step + 1
         self.in_force = {i: since for i, since in enumerate(self._since) if since != _NEVER}
@@ -87,8 +95,7 @@ class Schedule:
         if fault.trigger.kind == TriggerKind.HAZARD:
             plan = self._plan
             stream = _HAZARD_STREAM + place
-            bits = random_bits(plan.seed, plan.episode, step, fault.robot, stream)
-            return (int(bits[0]) >> 11) * 2.0**-53 < values[0]
+            return _uniform(plan.seed, plan.episode, step, fault.robot, stream) < values[0]
         if world is None:  # a step that was skipped
             return False
         if fault.trigger.kind == TriggerKind.RETURN_ABOVE:
@@ -108,6 +115,12 @@ class Schedule:
             and (self._since[place] != _NEVER or _overlaps(other, fault, step))
         }
         return len(others) < self._plan.cap
+
+
+@lru_cache(maxsize=4096)
+def _uniform(seed: int, episode: int, step: int, robot: int, stream: int) -> float:
+    """In [0, 1). Kept, because a gate follows the schedule once for each robot of the team."""
+    return (int(random_bits(seed, episode, step, robot, stream)[0]) >> 11) * 2.0**-53
 
 
 def _overlaps(other: Fault, fault: Fault, step: int) -> bool:

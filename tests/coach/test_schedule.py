@@ -154,6 +154,23 @@ def test_skipping_steps_changes_nothing_without_conditions(
         assert schedule.in_force == history[step]
 
 
+@pytest.mark.timeout(20)
+def test_an_absurd_step_neither_hangs_nor_hides_what_is_in_force() -> None:
+    last = 2**32 - 1
+    crash = plan(
+        Fault(0, "mute", 3),
+        Fault(1, "mute", last - 1, 5),
+        Fault(2, "mute", 0, 4),
+        Fault(2, "mute", 0, 0, trigger=Trigger(TriggerKind.HAZARD, (0.01,))),
+    )
+    schedule = Schedule(crash)
+    schedule.enter(2, None)
+    assert 2 in schedule.in_force
+    schedule.enter(last, None)
+    assert {0, 1, 3} == set(schedule.in_force)
+    assert (schedule.in_force[0], schedule.in_force[1]) == (3, last - 1)
+
+
 @pytest.mark.parametrize("p", [0.05, 0.4])
 def test_a_hazard_strikes_at_its_rate_in_every_step(p: float, fits: Callable[..., bool]) -> None:
     """First strikes are geometric, over episodes and robots; and so are those after a recovery."""
