@@ -51,3 +51,17 @@ def bytes_from_answer(answer: Answer[bytes]) -> bytes:
     return answer.stamp + _COMMANDED.pack(
         answer.episode, answer.step, answer.action, answer.worst_action, 0
     )
+
+
+def fault_from_bytes(data: bytes) -> tuple[int, int]:
+    """(action, fault) of a crash_coach_interfaces/Action.
+
+    Raises:
+        UserError: shorter than it says.
+    """
+    try:
+        (length,) = _FRAME_ID_LENGTH.unpack_from(data, _FRAME_ID_AT - 4)
+        fields = _COMMANDED.unpack_from(data, _FRAME_ID_AT + (length + 3 & ~3))
+    except struct.error as error:
+        raise UserError(f"command of {len(data)} bytes is cut short: {error}") from error
+    return fields[2], fields[4]

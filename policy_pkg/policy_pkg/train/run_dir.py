@@ -15,9 +15,10 @@ import fcntl
 import json
 import os
 import platform
+import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -119,8 +120,8 @@ def _commit() -> str | None:
 
 
 def _check_same(run: dict[str, Any], config: RunConfig, path: Path) -> None:
-    before = _flat(run.get("config", {}))
-    now = _flat(config.model_dump(mode="json"))
+    before = flat(run.get("config", {}))
+    now = flat(config.model_dump(mode="json"))
     for key in sorted({*before, *now}):
         old, new = before.get(key, "nothing"), now.get(key, "nothing")
         if old != new:
@@ -141,11 +142,12 @@ def _check_same_data(run: dict[str, Any], data: dict[str, Any] | None, out_dir: 
         )
 
 
-def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """{"coach": {"beta": 1}} -> {"coach.beta": 1}"""
     flat: dict[str, Any] = {}
     for key, value in values.items():
         if isinstance(value, dict):
-            flat.update(_flat(value, f"{prefix}{key}."))
+            flat.update(flat(value, f"{prefix}{key}."))
         else:
             flat[prefix + key] = value
     return flat
@@ -153,6 +155,11 @@ def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def checkpoint_path(out_dir: Path, env_steps: int) -> Path:
     return out_dir / CHECKPOINTS / f"step_{env_steps:09d}"
+
+
+def seedless_name(run: Path) -> str:
+    """The folder's name without -s<seed>."""
+    return re.sub(r"(?<=.)-s\d+$", "", run.resolve().name)
 
 
 @contextmanager

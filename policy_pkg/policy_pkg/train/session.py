@@ -20,7 +20,7 @@ from policy_pkg.train.learner import Learner
 from policy_pkg.train.metrics import Means, Value
 from policy_pkg.train.replay import Replay
 from policy_pkg.train.rollout import Finished, Rollout
-from sim_pkg.contract import BatchEnv, UserError
+from sim_pkg.contract import BatchEnv, EnvSpec, UserError
 
 TEST_ARENAS = 32
 _TEST_KEY = 0x7E57
@@ -137,6 +137,10 @@ class Session:
         self.sampling = generator(config.seed, SAMPLING)
         exploration = generator(config.seed, EXPLORATION)
         self.rollout = Rollout(self.env, self.policy, self.coach.plan, config.seed, exploration)
+
+    @property
+    def spec(self) -> EnvSpec:
+        return self.env.spec
 
     @property
     def progress(self) -> Progress:

@@ -13,6 +13,7 @@ from policy_pkg.checkpoint import (
     read_tensors,
     write_checkpoint,
 )
+from policy_pkg.train.live_session import LiveSession
 from policy_pkg.train.metrics import Value
 from policy_pkg.train.run_dir import checkpoint_path
 from policy_pkg.train.session import Counters, Session
@@ -29,13 +30,13 @@ class Logged:
     last_block: dict[str, Value] | None = None
 
 
-def save(out_dir: Path, session: Session, logged: Logged) -> Path:
+def save(out_dir: Path, session: Session | LiveSession, logged: Logged) -> Path:
     """Writes a checkpoint of ``session`` and removes all but the newest ones.
 
     Raises:
         OSError: it could not be written; the older ones are untouched.
     """
-    spec, done = session.env.spec, session.counters
+    spec, done = session.spec, session.counters
     tensors, values = session.state_dict()
     manifest = Manifest(
         scenario=session.config.scenario,
@@ -51,14 +52,19 @@ def save(out_dir: Path, session: Session, logged: Logged) -> Path:
     return folder
 
 
-def restore(folder: Path, session: Session) -> Logged:
+def restore(folder: Path, session: Session | LiveSession) -> Logged:
     """Continues from the checkpoint in ``folder``; only for a session not yet used.
 
     Raises:
         CheckpointError: names the file and what is wrong with it.
     """
     manifest = read_manifest(folder)
-    stems = ["learner", "rollout"] + (["replay"] if session.config.checkpoint_replay else [])
+    live = isinstance(session, LiveSession)
+    if live is ("rollout" in manifest.files):
+        verb = "train" if live else "train-live"
+        raise CheckpointError(f"{folder} is of a run of {verb}, which has to continue it")
+    stems = ["learner"] if live else ["learner", "rollout"]
+    stems += ["replay"] if session.config.checkpoint_replay else []
     tensors = {stem: read_tensors(folder, manifest, stem) for stem in stems}
     values: dict[str, Any] = manifest.training
     try:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from crash_coach_bringup.cli.output import CliError
-from policy_pkg.train.run_dir import METRICS, RUN, read_run
+from policy_pkg.train.run_dir import METRICS, RUN, read_run, seedless_name
 
 STEPS = "env_steps"
 # Keys of metrics.jsonl that are drawn.
@@ -173,7 +172,7 @@ def _labels(groups: Sequence[Sequence[Run]]) -> list[str]:
     """Folder names without -s<seed>; with the folder above, or in full, where two were the same."""
 
     def name(run: Run) -> str:
-        return re.sub(r"(?<=.)-s\d+$", "", run.path.resolve().name)
+        return seedless_name(run.path)
 
     def above(run: Run) -> str:
         return f"{run.path.resolve().parent.name}/{name(run)}"

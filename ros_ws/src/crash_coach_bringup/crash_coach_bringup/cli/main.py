@@ -19,6 +19,7 @@ from crash_coach_bringup.cli import (
     record,
     render,
     train,
+    train_live,
     train_offline,
     up,
 )
@@ -39,6 +40,7 @@ app = typer.Typer(
 )
 app.command("doctor")(doctor.doctor)
 app.command("train")(train.train)
+app.command("train-live")(train_live.train_live)
 app.command("train-offline")(train_offline.train_offline)
 app.command("evaluate")(evaluate.evaluate)
 app.add_typer(faults.app, name="faults")

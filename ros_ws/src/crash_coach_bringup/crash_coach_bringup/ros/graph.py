@@ -21,7 +21,7 @@ from sim_pkg.env import make_env
 
 Mode = Literal["lockstep", "realtime"]
 Layout = Literal["nodes", "team", "single"]
-Value = bool | int | float | str | Sequence[str] | Sequence[float]
+Value = bool | int | float | str | Sequence[str] | Sequence[float] | Sequence[int]
 
 LOST_STEPS = 3  # without a command, as the sim's own default
 DOMAIN_LIMIT = 232  # rmw: higher ids have no valid UDP ports
@@ -40,11 +40,12 @@ class UpOptions:
     the file ``fault_scenario`` overrules; ``sim`` further parameters of the sim.
     ``relay_observations``: observations pass through the gate, so that faults of them can be
     injected later; where the coach starts with such faults, they do anyway. ``gate`` false leaves
-    coach and gate out: the policies command the robots directly.
+    coach and gate out: the policies command the robots directly. ``checkpoint`` None: a trainer
+    gives the policies their weights, and the coach its success rates.
     """
 
     scenario: str
-    checkpoint: Path
+    checkpoint: Path | None
     mode: Mode = "lockstep"
     layout: Layout = "nodes"
     seed: int = 0
@@ -115,6 +116,8 @@ def coach_parameters(options: UpOptions, team: TeamSpec) -> dict[str, Value]:
     """
     config = options.coach
     parameters: dict[str, Value] = {"robots": list(team.robots), "seed": options.seed}
+    if options.checkpoint is None:
+        parameters["success_from"] = "trainer"
     if team.roles:
         parameters["roles"] = list(team.roles)
     if team.dt_s is not None:
@@ -150,7 +153,8 @@ def check_team(options: UpOptions) -> TeamSpec:
         policy_pkg.checkpoint.CheckpointError: no usable checkpoint, or one of another team.
     """
     spec = make_env(options.scenario, 1).spec
-    load_policy(options.checkpoint).check_spec(spec)
+    if options.checkpoint is not None:
+        load_policy(options.checkpoint).check_spec(spec)
     return TeamSpec.of(spec)
 
 
@@ -166,10 +170,11 @@ def lost_after_s(options: UpOptions, dt_s: float) -> float:
 
 def graph_nodes(options: UpOptions, team: TeamSpec) -> list[Node]:
     """The graph's nodes, the sim last: the others are ready to answer when it starts."""
-    acting: dict[str, Value] = {
-        "checkpoint": str(options.checkpoint.resolve()),
-        "command_topic": "command_raw" if options.gate else "command",
-    }
+    acting: dict[str, Value] = {"command_topic": "command_raw" if options.gate else "command"}
+    if options.checkpoint is None:
+        acting["live"] = True
+    else:
+        acting["checkpoint"] = str(options.checkpoint.resolve())
     relays = relays_observations(options)
     if relays:
         acting["observation_topic"] = "observation_seen"

@@ -1,0 +1,240 @@
+"""Finished runs: which there are, what distinguishes them, and what is worth keeping of them.
+
+Two runs are two seeds of one method where their settings are equal; the scenario, the seed and the
+length of the run are no settings. What a method is called comes from the folders' names.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import re
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from policy_pkg.checkpoint import AGENT, CHECKPOINTS, MANIFEST, find_checkpoint, read_manifest
+from policy_pkg.train.config import TrainConfig
+from policy_pkg.train.offline_config import OfflineConfig
+from policy_pkg.train.run_dir import METRICS, RUN, TIMING, RunError, flat, read_run, seedless_name
+
+AGENT_FILES = (f"{AGENT}.safetensors", MANIFEST)
+LENGTHS = ("total_steps", "gradient_steps")  # of a run: trained in the simulator, or offline
+NO_SETTING = {
+    *("scenario", "seed", *LENGTHS),
+    *("tensorboard", "checkpoint_interval_steps", "checkpoint_replay"),
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run with a checkpoint; ``agent``: SHA-256 of the weights that act.
+
+    ``settings``: what its method consists of. ``steps``: of the newest checkpoint.
+    """
+
+    path: Path
+    method: str
+    scenario: str
+    seed: int
+    settings: Mapping[str, Any]
+    steps: int
+    total_steps: int
+    agent: str
+
+    @property
+    def finished(self) -> bool:
+        return self.steps >= self.total_steps
+
+
+def find_runs(folders: Iterable[Path]) -> list[Path]:
+    """Run directories, each given as itself or by the folder it lies in; in order of their names.
+
+    Raises:
+        RunError: a folder that is no run and holds none.
+    """
+    found: list[Path] = []
+    for folder in folders:
+        inside = [folder] if (folder / RUN).is_file() else _inside(folder)
+        if not inside:
+            raise RunError(f"{folder}: neither a run nor a folder of runs: no {RUN}, no */{RUN}")
+        found += inside
+    return list(dict.fromkeys(found))
+
+
+def _inside(folder: Path) -> list[Path]:
+    return sorted(path.parent for path in folder.glob(f"*/{RUN}"))
+
+
+def read_runs(paths: Iterable[Path]) -> list[Run]:
+    """Runs with their methods' names, see ``method_name``.
+
+    Where one name would stand for two settings, the name of the folder above is put before it.
+
+    Raises:
+        CheckpointError: a run without a checkpoint, or a damaged one.
+        RunError: a damaged run.json; one name for two settings; the same run twice.
+    """
+    runs = [_read(path) for path in paths]
+    if _clash(runs):
+        runs = [
+            replace(run, method=f"{run.path.resolve().parent.name}/{run.method}") for run in runs
+        ]
+    if reason := _clash(runs):
+        raise RunError(reason)
+    return runs
+
+
+def _read(path: Path) -> Run:
+    content = read_run(path)["config"]
+    model = TrainConfig if "total_steps" in content else OfflineConfig
+    try:
+        config = model.model_validate(content).model_dump(mode="json")
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise RunError(f"{path / RUN}: config.{place}: {first['msg']}") from error
+    checkpoint = find_checkpoint(path)
+    manifest = read_manifest(checkpoint)
+    if AGENT not in manifest.files:
+        raise RunError(f"{checkpoint / MANIFEST} lists no {AGENT}.safetensors")
+    settings = {key: value for key, value in config.items() if key not in NO_SETTING}
+    return Run(
+        path=path,
+        method=method_name(path, manifest.scenario, settings),
+        scenario=manifest.scenario,
+        seed=config["seed"],
+        settings=settings,
+        steps=_steps(checkpoint),
+        total_steps=_wanted(config),
+        agent=manifest.files[AGENT].sha256,
+    )
+
+
+def _steps(checkpoint: Path) -> int:
+    return int(checkpoint.name.removeprefix("step_"))
+
+
+def _wanted(config: Mapping[str, Any]) -> int:
+    """How many steps the run is meant to take."""
+    return int(next(config[key] for key in LENGTHS if key in config))
+
+
+def method_name(path: Path, scenario: str, settings: Mapping[str, Any]) -> str:
+    """The folder's name without -s<seed> and without the map; else algorithm and strategy.
+
+    ``adaptive-s0`` and ``3m-adaptive-s0`` on skirmish/3m are both "adaptive"; ``3m-s0`` is
+    "qmix", or with a coach "qmix, adaptive".
+    """
+    arena = re.escape(Path(scenario).name.removesuffix(".yaml"))
+    name = re.sub(rf"(^|[-_.]){arena}(?=$|[-_.])", "", seedless_name(path)).strip("-_.")
+    if name:
+        return name
+    parts = [settings["learner"]["algorithm"]]
+    strategy = settings.get("coach", {}).get("strategy", "none")
+    return ", ".join(parts if strategy == "none" else [*parts, strategy])
+
+
+def _clash(runs: Sequence[Run]) -> str | None:
+    """Why these runs' names cannot stand as they are."""
+    settings: dict[str, Run] = {}
+    seeds: dict[tuple[str, str, int], Run] = {}
+    for run in runs:
+        other = settings.setdefault(run.method, run)
+        if other.settings != run.settings:
+            before, now = flat(other.settings), flat(run.settings)
+            key = min(k for k in {*before, *now} if before.get(k) != now.get(k))
+            return (
+                f"{other.path} and {run.path} would both be called {run.method!r}, but {key} is "
+                f"{before.get(key)!r} in one and {now.get(key)!r} in the other: rename a folder"
+            )
+        other = seeds.setdefault((run.method, run.scenario, run.seed), run)
+        if other is not run:
+            return (
+                f"{other.path} and {run.path} are both {run.method!r} on {run.scenario} with "
+                f"seed {run.seed}: give one of them"
+            )
+    return None
+
+
+def wall_time_s(run: Path) -> float | None:
+    """Seconds a run took, over all processes that had a part in it; None without timing.jsonl.
+
+    Every process counts from its own start, so the parts' last figures are added. What a killed
+    process did after its last checkpoint was done again and is not counted.
+    """
+    total = last = 0.0
+    lines = read_lines(run / TIMING)
+    for line in lines:
+        wall_s = float(line["wall_s"])
+        if wall_s < last:  # another process began
+            total += last
+        last = wall_s
+    return total + last if lines else None
+
+
+def last_metrics(run: Path) -> dict[str, Any]:
+    """The last line of a run's metrics; empty where there are none."""
+    lines = read_lines(run / METRICS)
+    return lines[-1] if lines else {}
+
+
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """JSON lines of ``path``, or of ``path``.gz, which ``collect`` makes; empty without both.
+
+    Raises:
+        RunError: a damaged file or line.
+    """
+    packed = path.with_name(path.name + ".gz")
+    try:
+        if path.is_file():
+            text = path.read_text(encoding="utf-8")
+        elif packed.is_file():
+            path, text = packed, gzip.decompress(packed.read_bytes()).decode()
+        else:
+            return []
+        return [json.loads(line) for line in text.splitlines()]
+    except (OSError, EOFError, ValueError) as error:
+        raise RunError(f"{path} cannot be read: {error}") from error
+
+
+def collect(run: Path, results: Path) -> str | None:
+    """Copies what a report and an evaluation need of a finished run to ``results``/<its name>.
+
+    That is run.json, the metrics and the timing (compressed) and the last agent, some 100 kB.
+    A copy made before is replaced.
+
+    Returns:
+        Why nothing was copied, for a run that is not finished; else None.
+
+    Raises:
+        RunError: a damaged run, or something else of that name in ``results``.
+        OSError: it could not be written.
+    """
+    wanted = _wanted(read_run(run)["config"])
+    last = max((run / CHECKPOINTS).glob("step_*[0-9]"), default=None)
+    if last is None or _steps(last) < wanted:
+        done = 0 if last is None else _steps(last)
+        return f"{run}: not finished: checkpoint at {done:,} of {wanted:,} steps"
+    kept = results / run.name
+    if kept.resolve() == run.resolve() or (kept.exists() and not (kept / RUN).is_file()):
+        raise RunError(f"{kept} is not a copy of {run}: choose another folder for the results")
+    partial = results / f"{run.name}.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    agent = partial / CHECKPOINTS / last.name
+    agent.mkdir(parents=True)
+    for name in AGENT_FILES:
+        shutil.copyfile(last / name, agent / name)
+    shutil.copyfile(run / RUN, partial / RUN)
+    for name in (METRICS, TIMING):
+        if (run / name).is_file():
+            packed = gzip.compress((run / name).read_bytes(), mtime=0)
+            (partial / f"{name}.gz").write_bytes(packed)
+    if kept.exists():
+        shutil.rmtree(kept)
+    partial.rename(kept)
+    return None
