@@ -79,6 +79,10 @@ def test_other_bytes_are_refused() -> None:
     for size in (8, 20, 30):
         with pytest.raises(UserError, match=f"command of {size} bytes is cut short"):
             command_from_bytes(0, data[:size])
+    with pytest.raises(UserError, match="command of step 4294967295"):
+        command_from_bytes(0, serialize_message(Action(step=NEXT_STEP)))
+    with pytest.raises(UserError, match="observation of step 4294967295"):
+        sight_from_bytes(0, serialize_message(Observation(step=NEXT_STEP)))
 
 
 @pytest.mark.parametrize("frame_id", ["", "m", "ma", "map", "base", "odom_1"])

@@ -21,7 +21,7 @@ from std_msgs.msg import Header
 from crash_coach_pkg.effects import NO_ACTION
 from crash_coach_pkg.faults import fault_mode, mode_code
 from crash_coach_pkg.gate_types import Command, Decision, Seen, Sight
-from crash_coach_pkg.plan import CrashPlan, Fault, Trigger, TriggerKind
+from crash_coach_pkg.plan import NEXT_STEP, CrashPlan, Fault, Trigger, TriggerKind
 from crash_coach_pkg.plan_book import TEAM, Event
 from crash_coach_pkg.schedule import World
 from sim_pkg.contract import UserError
@@ -109,12 +109,14 @@ def command_from_bytes(robot: int, data: bytes) -> Command:
     """A serialized Action, which is the token (and where its fields start).
 
     Raises:
-        UserError: not little-endian CDR, or cut short.
+        UserError: not little-endian CDR, cut short, or of a step that is no step.
     """
     start = _body("command", data)
     if len(data) < start + _COMMANDED.size:
         raise UserError(f"command of {len(data)} bytes is cut short")
     episode, step, action, worst, _ = _COMMANDED.unpack_from(data, start)
+    if step == NEXT_STEP:  # the step after it would not fit the messages
+        raise UserError(f"command of step {step}: steps are below {NEXT_STEP}")
     return Command(robot, episode, step, action, worst, (data, start))
 
 
@@ -167,7 +169,7 @@ def sight_from_bytes(robot: int, data: bytes) -> Sight:
     """A serialized Observation, which is the token (and where its features start).
 
     Raises:
-        UserError: not little-endian CDR, or cut short.
+        UserError: not little-endian CDR, cut short, or of a step that is no step.
     """
     start = _body("observation", data)
     try:
@@ -179,6 +181,8 @@ def sight_from_bytes(robot: int, data: bytes) -> Sight:
         available = np.frombuffer(data, np.uint8, n_actions, available_at) != 0
     except (struct.error, ValueError) as error:
         raise UserError(f"observation of {len(data)} bytes is cut short: {error}") from error
+    if step == NEXT_STEP:
+        raise UserError(f"observation of step {step}: steps are below {NEXT_STEP}")
     return Sight(robot, episode, step, features, available, (data, features_at))
 
 
