@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -152,6 +153,13 @@ def test_what_no_gate_can_carry_out_is_refused(field: str, value: object, reason
         plan_from_message(message, TEAM)
 
 
+@pytest.mark.parametrize("rate", [-0.1, 1.5, math.nan])
+def test_a_rate_that_no_coach_could_go_on_from_is_refused(rate: float) -> None:
+    message = message_from_plan(replace(PLAN, rate=rate), TEAM, 1.0, Time())
+    with pytest.raises(UserError, match=r"rate .* is not in \[0, 1\]"):
+        plan_from_message(message, TEAM)
+
+
 @pytest.mark.parametrize("lease_s", [0.0, -1.0, math.nan, math.inf])
 def test_a_lease_that_never_ends_is_refused(lease_s: float) -> None:
     message = message_from_plan(PLAN, TEAM, lease_s, Time())
@@ -211,7 +219,10 @@ def test_observations_that_are_cut_short_are_refused() -> None:
 def test_conditions_see_positions_as_they_travel() -> None:
     message = EpisodeState(episode_return=-1.25)
     message.positions_m = array("f", [0.1, 2.0, -3.5, 4.0])
-    world = world_from_message(deserialize_message(serialize_message(message), EpisodeState))
+    message = deserialize_message(serialize_message(message), EpisodeState)
+    with pytest.raises(UserError, match="4 coordinates, not 2 for each of 3 robots"):
+        world_from_message(message, 3)
+    world = world_from_message(message, 2)
     assert world.episode_return == -1.25
     assert world.positions_m.dtype == np.float32
     assert world.positions_m.tolist() == np.array([[0.1, 2], [-3.5, 4]], np.float32).tolist()

@@ -68,9 +68,11 @@ def message_from_plan(
 
 def plan_from_message(message: CrashPlanMessage, robots: tuple[str, ...]) -> CrashPlan:
     """Raises UserError for what no gate could carry out: an unknown robot or mode, a trigger or
-    parameters that are malformed, a lease that is not positive."""
+    parameters that are malformed, a lease that is not positive, a rate outside [0, 1]."""
     if not 0 < message.lease_s < math.inf:
         raise UserError(f"lease_s {message.lease_s} is not a positive number of seconds")
+    if not 0 <= message.rate <= 1:
+        raise UserError(f"rate {message.rate} is not in [0, 1]")
     return CrashPlan(
         message.episode,
         message.revision,
@@ -196,7 +198,13 @@ def bytes_from_seen(seen: Seen) -> bytes:
     return data[:features_at] + features + data[features_at + len(features) :]
 
 
-def world_from_message(message: EpisodeState) -> World:
+def world_from_message(message: EpisodeState, n_robots: int) -> World:
+    """Raises UserError where it is of another team."""
+    if len(message.positions_m) != 2 * n_robots:
+        raise UserError(
+            f"/sim/episode has {len(message.positions_m)} coordinates, not 2 for each of "
+            f"{n_robots} robots"
+        )
     positions_m = np.array(message.positions_m, dtype=np.float32).reshape(-1, 2)
     return World(positions_m, message.episode_return)
 

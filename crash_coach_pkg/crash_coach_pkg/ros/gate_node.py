@@ -153,12 +153,10 @@ class ActionGate:
         self._send(self._state.observation(sight, time.monotonic()))
 
     def _on_episode(self, message: EpisodeState) -> None:
-        world = world_from_message(message)
-        if len(world.positions_m) != len(self._base.robots):
-            self._base.get_logger().error(
-                f"/sim/episode has {len(world.positions_m)} robots, the gate "
-                f"{len(self._base.robots)}; ignored"
-            )
+        try:
+            world = world_from_message(message, len(self._base.robots))
+        except UserError as error:
+            self._base.get_logger().error(f"{error}; ignored")
             return
         self._send(self._state.world(message.episode, message.step, world, time.monotonic()))
 
