@@ -253,3 +253,25 @@ def test_defaults_crash_nobody() -> None:
 def test_bad_teams(names: list[str], message: str) -> None:
     with pytest.raises(UserError, match=message):
         check_robots(names)
+
+
+def test_a_trainers_blocks_take_the_place_of_the_coachs_own() -> None:
+    adaptive = {"strategy": "adaptive", "beta": 0.5, "rho": 0.5, "alpha_max": 0.8}
+    coach = control(success_from="trainer", block_episodes=1, **adaptive)
+    coach.follow(0)
+    assert coach.finish(True) is None
+    record = coach.evaluated(0.75)
+    assert record is not None
+    assert (record.success_rate, record.decision, record.episodes) == (0.75, "raise", 1)
+    assert coach.rate == record.new_rate == 0.5
+    later = coach.follow(1)
+    assert later is not None
+    assert later.rate == 0.5
+    with pytest.raises(UserError, match=r"success rate 1.5 of a trainer's block"):
+        coach.evaluated(1.5)
+    coach.configure(settings(enabled=False, success_from="trainer", **adaptive), now=True)
+    assert coach.evaluated(0.75) is None
+    own = control(**adaptive)
+    own.follow(0)
+    assert own.evaluated(0.75) is None
+    assert own.rate == 0.0

@@ -22,11 +22,11 @@ from policy_pkg.train.live_order import Task
 from sim_pkg.contract import EnvSpec, UserError
 
 SPIN_S = 0.05  # how soon a signal, or what another thread gave, is noticed
-START_S = 20.0  # until the nodes of a graph are there; a cold start compiles
+START_S = 120.0  # until the nodes of a graph are there; a cold start compiles
 ASK_AGAIN_S = 0.3
 ACK_S = 5.0
 ACK_POLL_S = 0.002
-EPISODE_S = 15.0  # the sim itself gives up sooner where robots do not answer
+EPISODE_S = 60.0  # the sim itself gives up sooner where robots do not answer
 PIECES_S = 10.0  # until the last messages of an episode that has ended are there
 UINT32 = 2**32
 
@@ -83,7 +83,6 @@ class GraphLink:
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._failure: UserError | None = None
-        # The executor's own way of taking work from other threads can lock up with Python's GIL.
         self._given: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
 
     def give(self, task: Task) -> None:

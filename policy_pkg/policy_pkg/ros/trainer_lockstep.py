@@ -90,11 +90,11 @@ class LockstepLink(GraphLink):
         self._playing[number], self._starting = self._starting, None
         self._next = number + 1
         self._deadline_s = time.monotonic() + EPISODE_S
-        if number not in self._ended:
-            self._running = number
         self._inbox.start_at(min(self._playing))
         if number in self._early:
             self._finished(number, self._early.pop(number))
+        elif number not in self._ended:
+            self._running = number
         self._turn()
 
     def _on_state(self, state: EpisodeState) -> None:
