@@ -1,25 +1,16 @@
-"""Many runs under many conditions: what each method achieves over its seeds, and how sure that is.
-
-Every run plays the same episodes under every condition, so methods are paired. What was evaluated
-is kept in a folder and not evaluated again.
-"""
+"""What methods achieve over their seeds on each map and under each condition."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from policy_pkg.checkpoint import load_policy
-from policy_pkg.train.evaluate import Condition, evaluate
-from policy_pkg.train.results import Run, RunError
+from policy_pkg.train.evaluate import Condition
+from policy_pkg.train.kept_evaluations import Result, arena
 from policy_pkg.train.statistics import (
     Estimate,
     binomial_weights,
@@ -29,57 +20,36 @@ from policy_pkg.train.statistics import (
     reweighted_success,
     wilson,
 )
-from sim_pkg.env import make_env
 
 ALL_MAPS = "all maps"
-LEAST_SEEDS = 3  # of either method, for a probability of improvement
-FORMAT = 1  # of the kept evaluations; a new number makes all of them be played again
 Scores = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What one run did under one condition; means are over its episodes."""
-
-    successes: int
-    episodes: int
-    return_mean: float
-    steps_mean: float
-    trajectory_hash: str
-
-    @property
-    def success(self) -> float:
-        return self.successes / self.episodes
-
-
-@dataclass(frozen=True)
-class Result:
-    """A run's outcomes by the condition's name, in the order in which they were asked for."""
-
-    run: Run
-    robots: int
-    outcomes: Mapping[str, Outcome]
+LEAST_SEEDS = 3  # of either method and map, for a probability of improvement
 
 
 @dataclass(frozen=True)
 class Row:
-    """A method on a map under a condition. ``success``: of each seed; so are ``returns``.
+    """A method on a map under a condition.
 
-    ``interval``: of the mean; Student's t over seeds; for a single seed Wilson's over episodes, or
-    that of the re-weighted estimate. ``iqm``: None for a single seed. ``not_measured``: the
-    largest probability of a number of crashed robots that a re-weighted estimate had no result
-    for, and counted as failure. A row over all maps has the maps' means in ``success``.
+    ``success``, ``returns``: of each seed; of a row over all maps, success is each map's mean.
+    ``interval``: 95 %, of the mean; Student's t over seeds, with one episode per run Wilson's
+    over seeds; for a single seed Wilson's over its episodes (of the re-weighted estimate, its
+    own); None over all maps.
+    ``iqm``: interquartile mean with stratified bootstrap; None for a single seed.
+    ``not_measured``: probability of the numbers of crashed robots that a re-weighted estimate has
+    no result for and counts as failures.
+    ``crashed``: exactly so many robots; None where the condition says something else.
     """
 
-    method: str
     scenario: str
     condition: str
+    method: str
     seeds: tuple[int, ...]
     success: tuple[float, ...]
     interval: Estimate | None
     iqm: Estimate | None
     returns: tuple[float, ...] = ()
     not_measured: float = 0.0
+    crashed: int | None = None
 
     @property
     def mean(self) -> float:
@@ -87,7 +57,7 @@ class Row:
 
     @property
     def std(self) -> float | None:
-        """The sample's, over seeds; None for a single one and over maps."""
+        """The sample's, over seeds; None for a single one and over all maps."""
         if len(self.seeds) < 2 or self.scenario == ALL_MAPS:
             return None
         return float(np.std(self.success, ddof=1))
@@ -97,51 +67,167 @@ class Row:
 class Improvement:
     """How probable it is that a run of one method succeeds more often than one of another."""
 
+    condition: str
     better: str
     worse: str
-    condition: str
     scenarios: tuple[str, ...]
     estimate: Estimate
 
 
-@dataclass
-class Evaluations:
-    """Evaluations by what went into them, in ``folder``/<run>.json.
+def exactly_crashed(condition: Condition) -> int | None:
+    """How many robots the condition crashes, where it draws exactly so many."""
+    crash = condition.crash
+    if crash.strategy == "none":
+        return 0
+    return crash.crashed_exactly if crash.crashed_exactly >= 0 else None
 
-    The key covers the agent's weights, the scenario's settings, the condition, the number of
-    episodes and the seed; it does not cover the program itself.
+
+def rows(results: Sequence[Result], rates: Sequence[float]) -> list[Row]:
+    """A row per map, condition and method; then those over all maps, where there are several.
+
+    Args:
+        results: of all runs, with the same conditions on the same map.
+        rates: crash rates to be estimated from the results for exact numbers of crashed robots.
     """
+    groups: dict[str, dict[str, list[Result]]] = {}  # map -> method -> results
+    for result in sorted(results, key=lambda r: (r.run.scenario, r.run.method, r.run.seed)):
+        methods = groups.setdefault(result.run.scenario, {})
+        methods.setdefault(result.run.method, []).append(result)
+    found: list[Row] = []
+    for methods in groups.values():
+        first = next(iter(methods.values()))[0]
+        for index in range(len(first.outcomes)):
+            found += [_measured(group, index) for group in methods.values()]
+        for rate in rates:
+            found += [_reweighted(group, rate) for group in methods.values()]
+    return found + _over_maps(found, tuple(groups))
 
-    folder: Path
-    episodes: int
-    seed: int
-    _settings: dict[str, tuple[str, int]] = field(default_factory=dict)
 
-    def results(
-        self,
-        run: Run,
-        conditions: Callable[[tuple[str, ...]], Sequence[tuple[str, Condition]]],
-        played: Callable[[str], None],
-    ) -> Result:
-        """Reads or plays every condition.
+def _measured(group: Sequence[Result], index: int) -> Row:
+    condition = group[0].outcomes[index][0]
+    outcomes = [result.outcomes[index][1] for result in group]
+    single = [wilson(outcome.successes, outcome.episodes) for outcome in outcomes]
+    row = _row(
+        group,
+        condition.name,
+        single,
+        returns=tuple(outcome.return_mean for outcome in outcomes),
+        crashed=exactly_crashed(condition),
+    )
+    if all(outcome.episodes == 1 for outcome in outcomes):
+        # Each seed is one success or failure: the counts have no normal distribution.
+        return replace(row, interval=wilson(sum(o.successes for o in outcomes), len(outcomes)))
+    return row
 
-        Args:
-            conditions: robots -> the conditions and their names.
-            played: told of each condition that had to be played, before it is.
 
-        Raises:
-            UserError: the checkpoint or a condition does not fit, or a kept file is damaged.
-            OSError: the folder cannot be written.
-        """
-        scenario, n_robots = self._scenario(run.scenario)
-        path = self.folder / f"{run.path.resolve().name}.json"
-        kept = _read_kept(path)
-        outcomes: dict[str, Outcome] = {}
-        for name, condition in conditions(make_robots(n_robots)):
-            key = self._key(run, scenario, condition)
-            if key not in kept:
-                played(name)
-                kept[key] = {"condition": name, **asdict(self._play(run, condition))}
-                _write_kept(path, kept)
-            outcomes[name] = Outcome(**{k: v for k, v in kept[key].items() if k != "condition"})
-        return Result(run, n_robots, outcomes)
+def _reweighted(group: Sequence[Result], rate: float) -> Row:
+    n = len(arena(group[0].run.scenario)[0])
+    single, missing = [], 0.0
+    for result in group:
+        exact = {
+            k: (outcome.successes, outcome.episodes)
+            for condition, outcome in result.outcomes
+            if (k := exactly_crashed(condition)) is not None
+        }
+        single.append(reweighted_success(exact, n, rate))
+        weights = binomial_weights(n, rate)
+        missing = sum(weight for k, weight in enumerate(weights) if k not in exact)
+    return _row(group, f"rate {rate:g}, re-weighted", single, not_measured=missing)
+
+
+def _row(
+    group: Sequence[Result],
+    condition: str,
+    single: Sequence[Estimate],
+    returns: tuple[float, ...] = (),
+    not_measured: float = 0.0,
+    crashed: int | None = None,
+) -> Row:
+    """``single``: each seed's success rate."""
+    scores = np.array([estimate.value for estimate in single])
+    several = len(single) > 1
+    interval = mean_interval(scores) if several else single[0]
+    return Row(
+        scenario=group[0].run.scenario,
+        condition=condition,
+        method=group[0].run.method,
+        seeds=tuple(result.run.seed for result in group),
+        success=tuple(scores.tolist()),
+        interval=Estimate(interval.value, max(0.0, interval.low), min(1.0, interval.high)),
+        iqm=bootstrap_interquartile_mean([scores], _draws()) if several else None,
+        returns=returns,
+        not_measured=not_measured,
+        crashed=crashed,
+    )
+
+
+def _draws() -> np.random.Generator:
+    """Draws of a bootstrap; the same for each, so that a report can be repeated."""
+    return np.random.default_rng(0)
+
+
+def _over_maps(found: Sequence[Row], maps: Sequence[str]) -> list[Row]:
+    """Of methods that were evaluated on all maps under a condition, each with several seeds."""
+    together: dict[tuple[str, str], list[Row]] = {}
+    for row in found:
+        together.setdefault((row.condition, row.method), []).append(row)
+    out = []
+    for (condition, method), same in together.items():
+        if len(maps) < 2 or len(same) < len(maps) or min(len(row.seeds) for row in same) < 2:
+            continue
+        scores = [np.array(row.success) for row in same]
+        out.append(
+            Row(
+                scenario=ALL_MAPS,
+                condition=condition,
+                method=method,
+                seeds=tuple(sorted({seed for row in same for seed in row.seeds})),
+                success=tuple(row.mean for row in same),
+                interval=None,
+                iqm=bootstrap_interquartile_mean(scores, _draws()),
+                not_measured=max(row.not_measured for row in same),
+                crashed=same[0].crashed,
+            )
+        )
+    return out
+
+
+def improvements(found: Sequence[Row]) -> list[Improvement]:
+    """Every two methods under each measured condition, the one with the higher mean first.
+
+    Over the maps on which both have at least LEAST_SEEDS. Re-weighted rows are left out: they
+    follow from measured ones.
+    """
+    scores: dict[str, dict[str, dict[str, Scores]]] = {}  # condition -> method -> map -> scores
+    means: dict[str, list[float]] = {}
+    for row in found:
+        if row.returns and len(row.seeds) >= LEAST_SEEDS:
+            methods = scores.setdefault(row.condition, {})
+            methods.setdefault(row.method, {})[row.scenario] = np.array(row.success)
+            means.setdefault(row.method, []).append(row.mean)
+    ranked = sorted(means, key=lambda method: (-float(np.mean(means[method])), method))
+    out = []
+    for condition, methods in scores.items():
+        for better, worse in combinations([m for m in ranked if m in methods], 2):
+            shared = [name for name in methods[better] if name in methods[worse]]
+            if shared:
+                estimate = probability_of_improvement(
+                    [methods[better][name] for name in shared],
+                    [methods[worse][name] for name in shared],
+                    _draws(),
+                )
+                out.append(Improvement(condition, better, worse, tuple(shared), estimate))
+    return out
+
+
+def best(found: Iterable[Row]) -> set[tuple[str, str, str]]:
+    """(map, condition, method) of the highest means where several methods are compared."""
+    together: dict[tuple[str, str], list[Row]] = {}
+    for row in found:
+        together.setdefault((row.scenario, row.condition), []).append(row)
+    out = set()
+    for same in together.values():
+        highest = max(row.mean for row in same)
+        if len(same) > 1:
+            out |= {(r.scenario, r.condition, r.method) for r in same if r.mean >= highest - 1e-12}
+    return out

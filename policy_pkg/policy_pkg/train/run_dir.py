@@ -144,13 +144,13 @@ def _check_same_data(run: dict[str, Any], data: dict[str, Any] | None, out_dir: 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """{"coach": {"beta": 1}} -> {"coach.beta": 1}"""
-    flat: dict[str, Any] = {}
+    out: dict[str, Any] = {}
     for key, value in values.items():
         if isinstance(value, dict):
-            flat.update(flat(value, f"{prefix}{key}."))
+            out.update(flat(value, f"{prefix}{key}."))
         else:
-            flat[prefix + key] = value
-    return flat
+            out[prefix + key] = value
+    return out
 
 
 def checkpoint_path(out_dir: Path, env_steps: int) -> Path:

@@ -10,6 +10,7 @@ import typer
 from crash_coach_bringup.cli import (
     bags,
     calibrate,
+    collect,
     demo,
     doctor,
     evaluate,
@@ -18,6 +19,7 @@ from crash_coach_bringup.cli import (
     plot,
     record,
     render,
+    report,
     train,
     train_live,
     train_offline,
@@ -50,6 +52,8 @@ app.command("record")(record.record)
 app.add_typer(bags.app, name="bags")
 app.command("demo")(demo.demo)
 app.command("plot")(plot.plot)
+app.command("collect")(collect.collect)
+app.command("report")(report.report)
 app.command("render")(render.render)
 app.command("calibrate")(calibrate.calibrate)
 

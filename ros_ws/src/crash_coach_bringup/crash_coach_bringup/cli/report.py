@@ -1,0 +1,155 @@
+"""`crash-coach report`: many runs evaluated alike; tables and figures over seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from crash_coach_bringup.cli.crash_options import (
+    ModeOption,
+    ParamOption,
+    conditions,
+    mode_parameters,
+)
+from crash_coach_bringup.cli.evaluate import MOST_EPISODES
+from crash_coach_bringup.cli.output import CliError, console, write_json
+from crash_coach_bringup.cli.report_page import page
+from policy_pkg.train.evaluate import Condition, crash_free, named
+from policy_pkg.train.kept_evaluations import Evaluations, Result, arena
+from policy_pkg.train.report import exactly_crashed, improvements, rows
+from policy_pkg.train.results import Run, find_runs, last_metrics, read_runs, wall_time_s
+
+CRASHED = (0, 1, 2)
+RATES = (0.01, 0.05, 0.1)
+
+
+def asked(
+    robots: tuple[str, ...],
+    crashed: Sequence[int] | None,
+    rates: Sequence[float] | None,
+    each_robot: bool,
+    mode: str,
+    parameters: Mapping[str, float],
+) -> list[Condition]:
+    """The conditions, exact numbers first; without any option all that a result should state."""
+    if not crashed and not rates and not each_robot:
+        crashed, rates = [k for k in CRASHED if k <= len(robots)], RATES
+    counts, drawn = list(dict.fromkeys(crashed or [])), list(dict.fromkeys(rates or []))
+    if not counts and not drawn:
+        found = []
+    else:
+        found = conditions(robots, drawn, counts, [], mode, parameters)
+        found = [*found[len(drawn) :], *found[: len(drawn)]]
+    found = [crash_free() if exactly_crashed(c) == 0 else c for c in found]
+    if each_robot:
+        found += [named([robot], mode, parameters) for robot in robots]
+    return found
+
+
+def report(
+    folders: Annotated[
+        list[Path] | None, typer.Argument(metavar="DIR", help="Runs, or folders of runs.")
+    ] = None,
+    out: Annotated[
+        Path, typer.Option(help="Folder for the tables and figures; goes on where it was left.")
+    ] = Path("report"),
+    episodes: Annotated[
+        int, typer.Option(help="Episodes per run and condition.", min=1, max=MOST_EPISODES)
+    ] = 128,
+    crashed: Annotated[
+        list[int] | None,
+        typer.Option(help="K ...: exactly K robots, drawn anew each episode. [default: 0 1 2]"),
+    ] = None,
+    crash_rate: Annotated[
+        list[float] | None,
+        typer.Option(
+            help="R ...: each robot crashes with probability R; with --crashed also estimated "
+            "from its results. [default: 0.01 0.05 0.1; without default if --crashed is given]"
+        ),
+    ] = None,
+    each_robot: Annotated[
+        bool, typer.Option("--each-robot", help="Also each robot alone, in every episode.")
+    ] = False,
+    mode: ModeOption = "mute",
+    param: ParamOption = None,
+    seed: Annotated[int, typer.Option(help="Of the episodes, the same for every run.", min=0)] = 0,
+    trajectories: Annotated[
+        int | None,
+        typer.Option(help="SEED: draw the first episode of every method's run with that seed."),
+    ] = None,
+) -> None:
+    """Evaluates runs alike: methods, named after their folders, over their training seeds."""
+    if not folders:
+        raise CliError("nothing to report on: name runs or folders of runs")
+    parameters = mode_parameters(mode, param or [])
+    runs = read_runs(find_runs(folders))
+    wanted = {
+        name: asked(arena(name)[0], crashed, crash_rate, each_robot, mode, parameters)
+        for name in dict.fromkeys(run.scenario for run in runs)
+    }
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        results = _play(runs, wanted, Evaluations(out / "evaluations", episodes, seed))
+        exact = any(exactly_crashed(c) is not None for found in wanted.values() for c in found)
+        rates = crash_rate or ([] if crashed or each_robot else RATES)
+        found = rows(results, list(dict.fromkeys(rates)) if exact else [])
+        better = improvements(found)
+        about = {"episodes": episodes, "seed": seed, "mode": mode, "parameters": parameters}
+        described = [describe(result) for result in results]
+        text = page(about, found, described)
+        (out / "table.md").write_text(text, encoding="utf-8")
+        write_json(
+            out / "results.json",
+            {
+                **about,
+                "rows": [asdict(row) for row in found],
+                "improvements": [asdict(each) for each in better],
+                "runs": described,
+            },
+        )
+        # Imported here: matplotlib takes a second.
+        from crash_coach_bringup.cli import report_figures
+
+        drawn = report_figures.write(found, better, out)
+        if trajectories is not None:
+            drawn.append(report_figures.trajectories(results, trajectories, seed, out))
+    except OSError as error:
+        raise CliError(f"--out {out}: {error.strerror}: {error.filename}") from error
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
+    for path in (out / "table.md", out / "results.json", *drawn):
+        console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _play(
+    runs: Sequence[Run], wanted: Mapping[str, Sequence[Condition]], evaluations: Evaluations
+) -> list[Result]:
+    results = []
+    for run in runs:
+
+        def say(condition: Condition, run: Run = run) -> None:
+            text = f"{run.path} on {run.scenario}: {condition.name}"
+            console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+        results.append(evaluations.result(run, wanted[run.scenario], say))
+    return results
+
+
+def describe(result: Result) -> dict[str, Any]:
+    """A run in figures, JSON values; null where its directory does not tell."""
+    run, metrics = result.run, last_metrics(result.run.path)
+    return {
+        "run": str(run.path),
+        "scenario": run.scenario,
+        "method": run.method,
+        "seed": run.seed,
+        "steps": run.steps,
+        "total_steps": run.total_steps,
+        "gradient_steps": metrics.get("gradient_steps"),
+        "new_alpha": metrics.get("new_alpha"),
+        "wall_s": wall_time_s(run.path),
+        "outcomes": {condition.name: asdict(outcome) for condition, outcome in result.outcomes},
+    }

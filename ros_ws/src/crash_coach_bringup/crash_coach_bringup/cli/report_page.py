@@ -1,0 +1,142 @@
+"""The report's tables in Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from crash_coach_bringup.cli.markdown import table
+from policy_pkg.train.report import ALL_MAPS, Row, best
+from policy_pkg.train.statistics import Estimate
+
+NONE = "–"
+
+
+def page(about: Mapping[str, Any], rows: Sequence[Row], runs: Sequence[Mapping[str, Any]]) -> str:
+    """``about``: episodes, seed, mode; ``runs``: as ``report.describe`` gives them."""
+    mode = about["mode"]
+    if about["parameters"]:
+        values = ", ".join(f"{name} = {value:g}" for name, value in about["parameters"].items())
+        mode += f" ({values})"
+    methods = list(dict.fromkeys(row.method for row in rows))
+    parts = [
+        f"Success in % of {about['episodes']} greedy episodes per run and condition (evaluation "
+        f"seed {about['seed']}, the same episodes for every run; crashed robots: {mode}).",
+    ]
+    if len(methods) > 1:
+        parts += ["## Methods", "Mean ± sample standard deviation over seeds; best in bold."]
+        parts.append(_overview(rows, methods))
+    parts += ["## Intervals", _meaning(rows), _details(rows)]
+    parts += ["## Runs", "Success in %, and after the comma the mean return.", _runs(runs)]
+    parts += [f"- {note}" for note in notes(rows, runs)]
+    return "\n\n".join(parts) + "\n"
+
+
+def figure(rate: float) -> str:
+    """In %; equal rates look equal, whatever order they were added up in."""
+    return f"{round(100 * rate, 9):.1f}"
+
+
+def percent(row: Row) -> str:
+    """'87.5 ± 3.1', without deviation for a single seed and over all maps."""
+    return figure(row.mean) if row.std is None else f"{figure(row.mean)} ± {figure(row.std)}"
+
+
+def span(estimate: Estimate | None) -> str:
+    return NONE if estimate is None else f"{figure(estimate.low)}..{figure(estimate.high)}"
+
+
+def _overview(rows: Sequence[Row], methods: Sequence[str]) -> str:
+    """Conditions down, methods across."""
+    bold = best(rows)
+    cells: dict[tuple[str, str], dict[str, str]] = {}
+    for row in rows:
+        text = percent(row)
+        if (row.scenario, row.condition, row.method) in bold:
+            text = f"**{text}**"
+        cells.setdefault((row.scenario, row.condition), {})[row.method] = text
+    lines = [[*key, *(by.get(name, NONE) for name in methods)] for key, by in cells.items()]
+    return table(["map", "condition", *methods], lines)
+
+
+def _meaning(rows: Sequence[Row]) -> str:
+    lines = []
+    if any(len(row.seeds) > 1 for row in rows):
+        lines.append(
+            "Intervals (95 %) of the mean are Student's t over training seeds; those of the "
+            "interquartile mean (IQM) are a stratified bootstrap over seeds, which with three to "
+            "five seeds is too narrow (see Evaluation in docs/algorithms.md). With one episode per "
+            "run the former is Wilson's over seeds."
+        )
+    if any(len(row.seeds) == 1 for row in rows):
+        lines.append(
+            "Rows of one seed have Wilson's interval over its episodes (re-weighted rows: its "
+            "combination over the strata): it says nothing about other training seeds."
+        )
+    return " ".join(lines)
+
+
+def _details(rows: Sequence[Row]) -> str:
+    lines = []
+    for row in rows:
+        iqm = NONE
+        if row.iqm is not None:
+            iqm = f"{figure(row.iqm.value)} ({span(row.iqm)})"
+        returns = f"{sum(row.returns) / len(row.returns):.2f}" if row.returns else NONE
+        place = (row.scenario, row.condition, row.method, len(row.seeds))
+        lines.append([*place, percent(row), span(row.interval), iqm, returns])
+    columns = ["map", "condition", "method", "seeds", "success", "95 %", "IQM (95 %)", "return"]
+    return table(columns, lines)
+
+
+def _runs(runs: Sequence[Mapping[str, Any]]) -> str:
+    names = list(dict.fromkeys(name for run in runs for name in run["outcomes"]))
+    lines = []
+    for run in runs:
+        alpha = NONE if run["new_alpha"] is None else f"{run['new_alpha']:.2f}"
+        updates = NONE if run["gradient_steps"] is None else f"{run['gradient_steps']:,}"
+        cells = [_outcome(run["outcomes"].get(name)) for name in names]
+        head = (run["scenario"], run["method"], run["seed"], f"{run['steps']:,}", updates)
+        lines.append([*head, _minutes(run["wall_s"]), alpha, *cells])
+    columns = ["map", "method", "seed", "steps", "gradient steps", "wall time", "α at the end"]
+    return table([*columns, *names], lines)
+
+
+def _outcome(outcome: Mapping[str, Any] | None) -> str:
+    if outcome is None:
+        return NONE
+    rate = 100 * outcome["successes"] / outcome["episodes"]
+    return f"{rate:.1f}, {outcome['return_mean']:.2f}"
+
+
+def _minutes(wall_s: float | None) -> str:
+    return NONE if wall_s is None else f"{wall_s / 60:.0f} min"
+
+
+def notes(rows: Sequence[Row], runs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What a reader of the figures has to know."""
+    out = []
+    for run in runs:
+        if run["steps"] < run["total_steps"]:
+            steps = f"{run['steps']:,} of {run['total_steps']:,} steps"
+            out.append(f"{run['run']} is not finished: {steps}.")
+    lengths: dict[tuple[str, str], set[int]] = {}
+    for run in runs:
+        lengths.setdefault((run["scenario"], run["method"]), set()).add(run["steps"])
+    for (scenario, method), found in lengths.items():
+        if len(found) > 1:
+            steps = ", ".join(f"{each:,}" for each in sorted(found))
+            out.append(
+                f"The seeds of {method} on {scenario} were not trained alike: {steps} steps."
+            )
+    for row in rows:
+        if row.not_measured > 0.001 and row.scenario != ALL_MAPS:
+            out.append(
+                f"{row.scenario}, {row.condition}: numbers of crashed robots that were not "
+                f"measured (probability {100 * row.not_measured:.1f} %) count as failures."
+            )
+    if any(row.std == 0 for row in rows):
+        out.append(
+            "Where all seeds score alike, their interval has no width: that is no certainty."
+        )
+    return list(dict.fromkeys(out))
