@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import random
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,11 +18,13 @@ from policy_pkg.live_weights import LiveAgent, Weights
 from policy_pkg.train.bag_dataset import RecordedEpisode
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.episode import Episode
-from policy_pkg.train.live_order import Task
-from policy_pkg.train.live_session import graph_seed
+from policy_pkg.train.live_order import Lockstep, Task
+from policy_pkg.train.live_session import LiveSession, graph_seed
+from policy_pkg.train.metrics import Value
 from sim_pkg.env import Env, make_env
 from sim_pkg.session import Session as Sim
 
+SPEC = make_env("buttons", 1).spec
 SMALL: dict[str, Any] = {
     "scenario": "buttons",
     "total_steps": 600,
@@ -135,3 +139,30 @@ class Player:
         modes = np.zeros(len(intent), np.uint8)
         modes[[fault.robot for fault in plan.faults]] = 1
         return np.where(modes != 0, self.sim.stay(), intent).astype(np.int32), modes
+
+
+class InProcess:
+    """A lock-step order and its graphs; episodes arrive in an order of ``shuffle``'s choice."""
+
+    def __init__(self, config: TrainConfig, shuffle: int | None = None) -> None:
+        self.session = LiveSession(config, SPEC)
+        self.order = Lockstep(self.session, self.end_block)
+        self.players = [Player(config, graph) for graph in range(config.n_envs)]
+        self.lines: list[dict[str, Value]] = []
+        self.tasks: list[Task] = []
+        self.shuffle = None if shuffle is None else random.Random(shuffle)
+
+    def end_block(self, block: Sequence[RecordedEpisode]) -> None:
+        self.lines.append(self.session.end_block(block))
+
+    def go(self, lose: frozenset[int] = frozenset()) -> None:
+        """To the end; the episodes of the tasks in ``lose`` are lost."""
+        waiting = self.order.begin()
+        while waiting:
+            self.tasks += waiting
+            done = [(task, self.players[task.graph].play(task)) for task in waiting]
+            if self.shuffle is not None:
+                self.shuffle.shuffle(done)
+            waiting = []
+            for task, recorded in done:
+                waiting += self.order.played(task, None if task.number in lose else recorded)

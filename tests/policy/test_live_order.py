@@ -3,62 +3,30 @@
 from __future__ import annotations
 
 import json
-import random
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from live_player import Player, small
+from live_player import SPEC, InProcess, Player, small
 
 from policy_pkg.checkpoint import CheckpointError, load_policy
 from policy_pkg.train.bag_dataset import RecordedEpisode
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.live import LiveRun
-from policy_pkg.train.live_order import LAG, Lockstep, RealTime, Task
+from policy_pkg.train.live_order import LAG, RealTime, Task
 from policy_pkg.train.live_session import LiveSession
 from policy_pkg.train.metrics import Value
 from policy_pkg.train.run_dir import RunError
 from policy_pkg.train.trainer import train
 from sim_pkg.contract import UserError
-from sim_pkg.env import make_env
-
-SPEC = make_env("buttons", 1).spec
-
-
-class Run:
-    """A lock-step order and its graphs; episodes arrive in an order of ``shuffle``'s choice."""
-
-    def __init__(self, config: TrainConfig, shuffle: int | None = None) -> None:
-        self.session = LiveSession(config, SPEC)
-        self.order = Lockstep(self.session, self.end_block)
-        self.players = [Player(config, graph) for graph in range(config.n_envs)]
-        self.lines: list[dict[str, Value]] = []
-        self.tasks: list[Task] = []
-        self.shuffle = None if shuffle is None else random.Random(shuffle)
-
-    def end_block(self, block: Sequence[RecordedEpisode]) -> None:
-        self.lines.append(self.session.end_block(block))
-
-    def go(self, lose: frozenset[int] = frozenset()) -> None:
-        """To the end; the episodes of the tasks in ``lose`` are lost."""
-        waiting = self.order.begin()
-        while waiting:
-            self.tasks += waiting
-            done = [(task, self.players[task.graph].play(task)) for task in waiting]
-            if self.shuffle is not None:
-                self.shuffle.shuffle(done)
-            waiting = []
-            for task, recorded in done:
-                waiting += self.order.played(task, None if task.number in lose else recorded)
 
 
 @pytest.mark.parametrize("graphs", [1, 3])
 def test_the_order_of_arrival_changes_nothing(graphs: int) -> None:
     config = small(n_envs=graphs, coach={"strategy": "fixed", "crash_rate": 0.3})
-    straight, shuffled = Run(config), Run(config, shuffle=5)
+    straight, shuffled = InProcess(config), InProcess(config, shuffle=5)
     straight.go()
     shuffled.go()
     assert straight.lines == shuffled.lines
@@ -69,14 +37,14 @@ def test_the_order_of_arrival_changes_nothing(graphs: int) -> None:
 
 
 def test_another_seed_is_another_run() -> None:
-    one, other = Run(small()), Run(small(seed=1))
+    one, other = InProcess(small()), InProcess(small(seed=1))
     one.go()
     other.go()
     assert one.session.agent != other.session.agent
 
 
 def test_an_episode_is_played_with_what_was_learned_before_the_one_under_way() -> None:
-    run = Run(small(total_steps=200, test_interval_steps=1000, updates_per_episode=1.0))
+    run = InProcess(small(total_steps=200, test_interval_steps=1000, updates_per_episode=1.0))
     after: list[bytes] = []  # the net after each training episode
     learn = run.session.learn
 
@@ -96,7 +64,7 @@ def test_an_episode_is_played_with_what_was_learned_before_the_one_under_way() -
 
 
 def test_a_block_has_the_metrics_of_train(tmp_path: Path) -> None:
-    run = Run(small())
+    run = InProcess(small())
     run.go()
     summary = train(small(n_envs=4), tmp_path / "run")
     assert list(run.lines[-1]) == list(summary.last_block)
@@ -110,7 +78,7 @@ def test_a_block_has_the_metrics_of_train(tmp_path: Path) -> None:
 
 
 def test_crashes_are_counted_as_the_coach_planned_them() -> None:
-    run = Run(small(coach={"strategy": "fixed", "crash_rate": 0.5}))
+    run = InProcess(small(coach={"strategy": "fixed", "crash_rate": 0.5}))
     run.go()
     assert {line["alpha"] for line in run.lines} == {0.5}
     assert run.lines[0]["crashed_fraction"] is None
@@ -121,7 +89,7 @@ def test_crashes_are_counted_as_the_coach_planned_them() -> None:
 
 def test_a_lost_episode_is_left_out_and_a_lost_test_played_again() -> None:
     config = small()
-    whole, robbed = Run(config), Run(config)
+    whole, robbed = InProcess(config), InProcess(config)
     whole.go()
     robbed.go(lose=frozenset((1, 6)))  # a test of the first block, and a training episode
     assert robbed.tasks[3].test
@@ -153,7 +121,7 @@ def test_real_time_shares_a_block_among_the_graphs_and_ends_it_without_what_was_
 
 
 def test_an_episode_of_another_team_is_refused() -> None:
-    run = Run(small())
+    run = InProcess(small())
     task = run.order.begin()[0]
     recorded = run.players[0].play(task)
     with pytest.raises(UserError, match="an episode of"):
