@@ -11,15 +11,16 @@ import numpy as np
 import numpy.typing as npt
 
 from crash_coach_pkg.coach import Coach
-from crash_coach_pkg.config import CoachConfig, TeamSpec
+from crash_coach_pkg.config import TeamSpec
 from crash_coach_pkg.plan import CrashPlan
+from crash_coach_pkg.strategies import Progress
 from policy_pkg.agent import Sensed
 from policy_pkg.live_weights import LiveAgent, Weights
 from policy_pkg.train.bag_dataset import RecordedEpisode
-from policy_pkg.train.config import TrainConfig
+from policy_pkg.train.config import TrainConfig, graph_seed
 from policy_pkg.train.episode import Episode
 from policy_pkg.train.live_order import Lockstep, Task
-from policy_pkg.train.live_session import LiveSession, graph_seed
+from policy_pkg.train.live_session import LiveSession
 from policy_pkg.train.metrics import Value
 from sim_pkg.env import Env, make_env
 from sim_pkg.session import Session as Sim
@@ -47,7 +48,7 @@ def small(**changes: object) -> TrainConfig:
 
 @dataclass
 class Player:
-    """One graph: a sim, a team that acts for itself, and a coach with a fixed rate."""
+    """One graph: a sim, a team that acts for itself, and a coach."""
 
     config: TrainConfig
     graph: int = 0
@@ -59,8 +60,7 @@ class Player:
         self.env: Env = make_env(self.config.scenario, 1)
         self.seed = graph_seed(self.config.seed, self.graph)
         self.sim = Sim(self.env, self.seed, self.first_episode)
-        crash = CoachConfig(strategy="fixed", crash_rate=self.config.coach.crash_rate)
-        self.coach = Coach(crash, TeamSpec.of(self.env.spec), self.seed)
+        self.coach = Coach(self.config.coach, TeamSpec.of(self.env.spec), self.seed)
         self.live: LiveAgent[int] | None = None
 
     def weights(self, task: Task, from_episode: int) -> Weights:
@@ -153,7 +153,10 @@ class InProcess:
         self.shuffle = None if shuffle is None else random.Random(shuffle)
 
     def end_block(self, block: Sequence[RecordedEpisode]) -> None:
-        self.lines.append(self.session.end_block(block))
+        line = self.session.end_block(block)
+        self.lines.append(line)
+        for player in self.players:
+            player.coach.record_block(float(line["success_rate"] or 0), Progress(0, 0, 0))
 
     def go(self, lose: frozenset[int] = frozenset()) -> None:
         """To the end; the episodes of the tasks in ``lose`` are lost."""

@@ -77,21 +77,17 @@ def trained(tmp_path: Path, layout: Layout, changes: dict[str, Any]) -> Path:
 def test_lock_step_over_ros_is_bit_for_bit_the_run_in_this_process(
     tmp_path: Path, layout: Layout, graphs: int
 ) -> None:
-    changes = {"n_envs": graphs, "coach": {"strategy": "fixed", "crash_rate": 0.3}}
+    coach = {"strategy": "adaptive", "beta": 0.0, "rho": 0.4, "alpha_max": 0.9}
+    changes = {"n_envs": graphs, "coach": coach}
     core = InProcess(small(seed=3, **changes))
     core.go()
     run = trained(tmp_path, layout, changes)
     assert metrics(run) == core.lines
     assert core.session.counters.episodes > 30
+    assert [line["alpha"] for line in core.lines] == pytest.approx([0.0, 0.4, 0.64, 0.784])
     newest = sorted((run / "checkpoints").iterdir())[-1]
     assert (newest / "agent.safetensors").read_bytes() == core.session.agent
     assert load_policy(run).scenario == "buttons"
-
-
-def test_the_coach_follows_the_trainers_blocks(tmp_path: Path) -> None:
-    coach = {"strategy": "adaptive", "beta": 0.0, "rho": 0.5, "alpha_max": 0.9}
-    lines = metrics(trained(tmp_path, "single", {"coach": coach, "total_steps": 400}))
-    assert [line["alpha"] for line in lines] == [0.0, 0.5, 0.75]
 
 
 # --- a trainer that dies --------------------------------------------------------------------
@@ -143,10 +139,10 @@ def test_in_real_time_the_graph_outlives_a_trainer_that_is_killed_and_returns(
     options = LiveOptions(
         "live/buttons",
         run,
-        overrides(total_steps=800),
+        overrides(total_steps=600),
         resume=True,
         mode="realtime",
-        sim={"real_time_factor": 40.0},
+        sim={"real_time_factor": 80.0},
     )
     config = load_train_config(options.config, options.overrides)
     with reserve_domain() as domain:
@@ -173,7 +169,7 @@ def test_in_real_time_the_graph_outlives_a_trainer_that_is_killed_and_returns(
                     assert second.wait(WAIT_S) == 0, log.read_text()
                 after = metrics(run)
                 assert after[: len(before) - 1] == before[:-1]
-                assert after[-1]["env_steps"] >= 800
+                assert after[-1]["env_steps"] >= 600
                 assert after[-1]["gradient_steps"] > before[-1]["gradient_steps"]
                 episodes.go_on()
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
+import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -78,6 +79,13 @@ class TrainConfig(BaseModel):
         """Linear from ``epsilon_start`` to ``epsilon_finish``, then constant."""
         done = min(1.0, env_steps / self.epsilon_anneal_steps)
         return self.epsilon_start + (self.epsilon_finish - self.epsilon_start) * done
+
+
+def graph_seed(seed: int, graph: int) -> int:
+    """Of the ``graph``-th sim and its exploration: graphs play different episodes."""
+    if graph == 0:
+        return seed
+    return int(np.random.SeedSequence([seed, graph]).generate_state(1, np.uint64)[0]) >> 1
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from typing import Literal, Self
 
 import torch
 
+from crash_coach_pkg.strategies import make_strategy
 from policy_pkg.checkpoint import CHECKPOINTS, list_checkpoints
 from policy_pkg.train.bag_dataset import RecordedEpisode
 from policy_pkg.train.config import TrainConfig
@@ -26,10 +27,21 @@ from policy_pkg.train.run_log import RunLog
 from policy_pkg.train.snapshot import Logged, restore, save
 from policy_pkg.train.trainer import TrainError, keep_batch
 from sim_pkg.contract import EnvSpec, UserError
+from sim_pkg.env import make_env
 
 Mode = Literal["lockstep", "realtime"]
 POLL_S = 0.1  # how soon the thread notices that it is to end
 QUEUE_EPISODES = 10_000  # in real time a learner that is too slow falls behind by so many at most
+
+
+def load_spec(config: TrainConfig) -> EnvSpec:
+    """The team's. Raises ConfigError where the scenario is unknown or wrong."""
+    return make_env(config.scenario, 1).spec
+
+
+def reads_blocks(config: TrainConfig) -> bool:
+    """Whether the coach's strategy needs the success rates of the run's blocks."""
+    return make_strategy(config.coach).needs_success
 
 
 class LiveRun:

@@ -28,13 +28,6 @@ from policy_pkg.train.session import (
 from sim_pkg.contract import EnvSpec, UserError
 
 
-def graph_seed(seed: int, graph: int) -> int:
-    """Of the ``graph``-th sim and its exploration: graphs play different episodes."""
-    if graph == 0:
-        return seed
-    return int(np.random.SeedSequence([seed, graph]).generate_state(1, np.uint64)[0]) >> 1
-
-
 class LiveSession:
     """Learns from the episodes that graphs play.
 

@@ -27,8 +27,7 @@ from crash_coach_bringup.ros.supervisor import Event, Supervisor, watch
 from crash_coach_bringup.ros.up import stop_signals
 from policy_pkg.checkpoint import CHECKPOINTS, list_checkpoints, read_manifest
 from policy_pkg.ros.recorder_node import PROFILE
-from policy_pkg.train.config import TrainConfig, load_train_config
-from policy_pkg.train.live_session import graph_seed
+from policy_pkg.train.config import TrainConfig, graph_seed, load_train_config
 
 TRAINER = "trainer"
 MATCH_S = 120.0  # the policies are there once the trainer has given them weights
