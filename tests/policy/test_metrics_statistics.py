@@ -14,6 +14,8 @@ from policy_pkg.train.statistics import (
     binomial_weights,
     bootstrap_interquartile_mean,
     interquartile_mean,
+    mean_interval,
+    probability_of_improvement,
     reweighted_success,
     wilson,
 )
@@ -56,19 +58,6 @@ def test_reweighting_is_the_mixture_of_the_strata() -> None:
     assert sum(binomial_weights(n, rate)) == pytest.approx(1.0)
 
 
-def test_reweighting_covers_the_truth_as_often_as_promised() -> None:
-    rng = np.random.default_rng(0)
-    truth = {0: 0.97, 1: 0.6, 2: 0.05}
-    n, rate, episodes = 2, 0.2, 64
-    value = sum(w * truth[k] for k, w in enumerate(binomial_weights(n, rate)))
-    hits = 0
-    for _ in range(2000):
-        exact = {k: (int(rng.binomial(episodes, p)), episodes) for k, p in truth.items()}
-        estimate = reweighted_success(exact, n, rate)
-        hits += estimate.low <= value <= estimate.high
-    assert 0.93 <= hits / 2000 <= 0.98
-
-
 def test_an_unmeasured_stratum_widens_only_the_upper_bound() -> None:
     whole = reweighted_success({0: (50, 50), 1: (50, 50), 2: (0, 50)}, 2, 0.3)
     part = reweighted_success({0: (50, 50), 1: (50, 50)}, 2, 0.3)
@@ -88,14 +77,59 @@ def test_interquartile_mean() -> None:
     assert interquartile_mean(np.array([7.0])) == 7.0
 
 
-def test_bootstrap_interval_covers_and_is_repeatable() -> None:
-    scores = np.random.default_rng(0).normal(10, 1, size=(8, 3))
+def test_bootstrap_interval_is_around_the_value_and_repeatable() -> None:
+    scores = np.random.default_rng(0).normal(10, 1, size=(3, 8))  # three tasks, eight seeds
     first, second = (
-        bootstrap_interquartile_mean(scores, np.random.default_rng(1), 500) for _ in range(2)
+        bootstrap_interquartile_mean(list(scores), np.random.default_rng(1), 500) for _ in range(2)
     )
     assert first == second
     assert first.low < first.value < first.high
     assert first.high - first.low < 2
+
+
+def test_tasks_may_have_different_numbers_of_seeds() -> None:
+    scores = [np.array([0.0, 1.0]), np.array([2.0, 3.0, 4.0, 5.0])]
+    found = bootstrap_interquartile_mean(scores, np.random.default_rng(0), 500)
+    assert found.value == pytest.approx(interquartile_mean(np.arange(6.0)))
+
+
+@pytest.mark.parametrize(
+    ("seeds", "quantile"),
+    [(2, 12.706), (3, 4.303), (4, 3.182), (5, 2.776), (6, 2.571), (31, 2.042)],
+)
+def test_intervals_of_means_use_the_tabled_quantiles_of_student(
+    seeds: int, quantile: float
+) -> None:
+    scores = np.random.default_rng(seeds).normal(0.5, 0.2, seeds)
+    found = mean_interval(scores)
+    half = quantile * scores.std(ddof=1) / np.sqrt(seeds)
+    assert [found.value, found.low, found.high] == pytest.approx(
+        [scores.mean(), scores.mean() - half, scores.mean() + half], abs=2e-4
+    )
+
+
+def test_one_score_has_no_interval_over_seeds() -> None:
+    with pytest.raises(ValueError, match="1 score"):
+        mean_interval(np.array([0.5]))
+
+
+def test_probability_of_improvement_counts_pairs() -> None:
+    rng = np.random.default_rng(0)
+    better, worse = [np.array([0.2, 0.5, 0.9])], [np.array([0.1, 0.5])]
+    found = probability_of_improvement(better, worse, rng)
+    assert found.value == pytest.approx((2 + 1 + 0.5 + 1) / 6)
+    assert 0 <= found.low < found.value < found.high <= 1
+    other = probability_of_improvement(worse, better, rng)
+    assert other.value == pytest.approx(1 - found.value)
+
+
+def test_probability_of_improvement_is_the_mean_over_tasks() -> None:
+    rng = np.random.default_rng(0)
+    wins, loses = np.array([1.0, 1.0, 1.0]), np.array([0.0, 0.0])
+    found = probability_of_improvement([wins, loses], [loses, wins], rng)
+    assert (found.value, found.low, found.high) == (0.5, 0.5, 0.5)
+    with pytest.raises(ValueError, match="of 1 and of 2 tasks"):
+        probability_of_improvement([wins], [loses, wins], rng)
 
 
 def test_means_are_of_what_was_added_and_start_anew() -> None:

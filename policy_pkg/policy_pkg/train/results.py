@@ -80,13 +80,13 @@ def read_runs(paths: Iterable[Path]) -> list[Run]:
         RunError: a damaged run.json; one name for two settings; the same run twice.
     """
     runs = [_read(path) for path in paths]
-    if _clash(runs):
-        runs = [
-            replace(run, method=f"{run.path.resolve().parent.name}/{run.method}") for run in runs
-        ]
-    if reason := _clash(runs):
+    reason = _clash(runs)
+    if reason is None:
+        return runs
+    longer = [replace(run, method=f"{run.path.resolve().parent.name}/{run.method}") for run in runs]
+    if _clash(longer):
         raise RunError(reason)
-    return runs
+    return longer
 
 
 def _read(path: Path) -> Run:

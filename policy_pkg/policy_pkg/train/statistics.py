@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from statistics import NormalDist
 
 import numpy as np
@@ -95,6 +96,7 @@ def mean_interval(scores: npt.NDArray[np.float64], confidence: float = 0.95) -> 
     return Estimate(mean, mean - half, mean + half)
 
 
+@cache
 def _student_quantile(freedom: int, confidence: float) -> float:
     """t with P(|T| < t) = ``confidence``, by bisection."""
     low, high = 0.0, 1.0
@@ -147,7 +149,8 @@ def bootstrap_interquartile_mean(
 ) -> Estimate:
     """Interquartile mean with a stratified percentile bootstrap interval.
 
-    With fewer than about ten seeds the interval is too narrow; docs/algorithms.md says by how much.
+    With fewer than about thirty scores in all the interval is too narrow; docs/algorithms.md says
+    by how much.
 
     Args:
         scores: of each task (seeds,); seeds are drawn with replacement within each task.

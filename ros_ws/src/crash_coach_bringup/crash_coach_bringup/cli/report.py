@@ -20,7 +20,7 @@ from crash_coach_bringup.cli.output import CliError, console, write_json
 from crash_coach_bringup.cli.report_page import page
 from policy_pkg.train.evaluate import Condition, crash_free, named
 from policy_pkg.train.kept_evaluations import Evaluations, Result, arena
-from policy_pkg.train.report import exactly_crashed, improvements, rows
+from policy_pkg.train.report import Row, exactly_crashed, improvements, rows
 from policy_pkg.train.results import Run, find_runs, last_metrics, read_runs, wall_time_s
 
 CRASHED = (0, 1, 2)
@@ -50,6 +50,23 @@ def asked(
     return found
 
 
+CrashedOption = Annotated[
+    list[int] | None,
+    typer.Option(help="K ...: exactly K robots, drawn anew each episode. [default: 0 1 2]"),
+]
+RateOption = Annotated[
+    list[float] | None,
+    typer.Option(
+        help="R ...: each robot crashes with probability R; with --crashed also estimated from "
+        "its results. [default: 0.01 0.05 0.1, or none where another crash option is given]"
+    ),
+]
+TrajectoriesOption = Annotated[
+    int | None,
+    typer.Option(help="SEED: draw the first episode of every method's run with that seed."),
+]
+
+
 def report(
     folders: Annotated[
         list[Path] | None, typer.Argument(metavar="DIR", help="Runs, or folders of runs.")
@@ -60,27 +77,15 @@ def report(
     episodes: Annotated[
         int, typer.Option(help="Episodes per run and condition.", min=1, max=MOST_EPISODES)
     ] = 128,
-    crashed: Annotated[
-        list[int] | None,
-        typer.Option(help="K ...: exactly K robots, drawn anew each episode. [default: 0 1 2]"),
-    ] = None,
-    crash_rate: Annotated[
-        list[float] | None,
-        typer.Option(
-            help="R ...: each robot crashes with probability R; with --crashed also estimated "
-            "from its results. [default: 0.01 0.05 0.1; without default if --crashed is given]"
-        ),
-    ] = None,
+    crashed: CrashedOption = None,
+    crash_rate: RateOption = None,
     each_robot: Annotated[
         bool, typer.Option("--each-robot", help="Also each robot alone, in every episode.")
     ] = False,
     mode: ModeOption = "mute",
     param: ParamOption = None,
     seed: Annotated[int, typer.Option(help="Of the episodes, the same for every run.", min=0)] = 0,
-    trajectories: Annotated[
-        int | None,
-        typer.Option(help="SEED: draw the first episode of every method's run with that seed."),
-    ] = None,
+    trajectories: TrajectoriesOption = None,
 ) -> None:
     """Evaluates runs alike: methods, named after their folders, over their training seeds."""
     if not folders:
@@ -91,37 +96,16 @@ def report(
         name: asked(arena(name)[0], crashed, crash_rate, each_robot, mode, parameters)
         for name in dict.fromkeys(run.scenario for run in runs)
     }
+    exact = any(exactly_crashed(c) is not None for found in wanted.values() for c in found)
+    rates = crash_rate or ([] if crashed or each_robot else RATES)
+    about = {"episodes": episodes, "seed": seed, "mode": mode, "parameters": parameters}
     try:
         out.mkdir(parents=True, exist_ok=True)
         results = _play(runs, wanted, Evaluations(out / "evaluations", episodes, seed))
-        exact = any(exactly_crashed(c) is not None for found in wanted.values() for c in found)
-        rates = crash_rate or ([] if crashed or each_robot else RATES)
         found = rows(results, list(dict.fromkeys(rates)) if exact else [])
-        better = improvements(found)
-        about = {"episodes": episodes, "seed": seed, "mode": mode, "parameters": parameters}
-        described = [describe(result) for result in results]
-        text = page(about, found, described)
-        (out / "table.md").write_text(text, encoding="utf-8")
-        write_json(
-            out / "results.json",
-            {
-                **about,
-                "rows": [asdict(row) for row in found],
-                "improvements": [asdict(each) for each in better],
-                "runs": described,
-            },
-        )
-        # Imported here: matplotlib takes a second.
-        from crash_coach_bringup.cli import report_figures
-
-        drawn = report_figures.write(found, better, out)
-        if trajectories is not None:
-            drawn.append(report_figures.trajectories(results, trajectories, seed, out))
+        _write(out, about, found, results, trajectories)
     except OSError as error:
         raise CliError(f"--out {out}: {error.strerror}: {error.filename}") from error
-    console.print(text, markup=False, highlight=False, soft_wrap=True)
-    for path in (out / "table.md", out / "results.json", *drawn):
-        console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _play(
@@ -153,3 +137,33 @@ def describe(result: Result) -> dict[str, Any]:
         "wall_s": wall_time_s(run.path),
         "outcomes": {condition.name: asdict(outcome) for condition, outcome in result.outcomes},
     }
+
+
+def _write(
+    out: Path,
+    about: Mapping[str, Any],
+    found: Sequence[Row],
+    results: Sequence[Result],
+    run_seed: int | None,
+) -> None:
+    """Tables, JSON and figures; ``run_seed``: whose trajectories are drawn, if any."""
+    better = improvements(found)
+    described = [describe(result) for result in results]
+    text = page(about, found, described)
+    (out / "table.md").write_text(text, encoding="utf-8")
+    content = {
+        **about,
+        "rows": [asdict(row) for row in found],
+        "improvements": [asdict(each) for each in better],
+        "runs": described,
+    }
+    write_json(out / "results.json", content)
+    # Imported here: no other verb should wait for matplotlib.
+    from crash_coach_bringup.cli import report_figures
+
+    drawn = report_figures.write(found, better, out)
+    if run_seed is not None:
+        drawn.append(report_figures.trajectories(results, run_seed, about["seed"], out))
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
+    for path in (out / "table.md", out / "results.json", *drawn):
+        console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,287 @@
+"""`crash-coach collect` and `report`: which runs, which methods, what the tables say, resuming."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from crash_coach_bringup.cli.collect import collect
+from crash_coach_bringup.cli.output import CliError
+from crash_coach_bringup.cli.report import asked, report
+from policy_pkg.train.config import TrainConfig
+from policy_pkg.train.results import find_runs, method_name, read_runs, wall_time_s
+from policy_pkg.train.run_dir import RunError, prepare_run
+from policy_pkg.untrained import write_untrained
+from sim_pkg.contract import UserError
+from sim_pkg.env import make_env
+
+WALL_S = (1.0, 30.0, 60.0, 2.0, 20.0)  # of two processes: the second counts from its own start
+
+
+def write_run(
+    folder: Path,
+    scenario: str = "buttons",
+    seed: int = 0,
+    steps: int = 200,
+    total_steps: int = 200,
+    **settings: Any,
+) -> Path:
+    """A run as training leaves it, of a team with random weights."""
+    config = {"scenario": scenario, "seed": seed, "total_steps": total_steps, **settings}
+    prepare_run(folder, TrainConfig.model_validate(config), resume=False)
+    line = {"env_steps": steps, "gradient_steps": 7, "new_alpha": 0.25}
+    (folder / "metrics.jsonl").write_text(json.dumps(line) + "\n")
+    timing = [{"env_steps": k, "wall_s": s, "steps_per_s": 1.0} for k, s in enumerate(WALL_S)]
+    (folder / "timing.jsonl").write_text("".join(json.dumps(row) + "\n" for row in timing))
+    checkpoint = folder / "checkpoints" / f"step_{steps:09d}"
+    write_untrained(checkpoint, make_env(scenario, 1).spec, seed=seed + 1, hidden=8)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two methods with three seeds each."""
+    folder = tmp_path_factory.mktemp("runs")
+    for seed in range(3):
+        write_run(folder / f"qmix-s{seed}", seed=seed)
+        vdn = {"algorithm": "vdn"}
+        write_run(folder / f"vdn-s{seed}", seed=seed + 10, learner=vdn)
+    return folder
+
+
+def results_of(folder: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((folder / "results.json").read_text())
+    return content
+
+
+def test_report_of_two_methods(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "report"
+    report([runs], out=out, episodes=16, crashed=[0, 1], crash_rate=[0.1])
+    names = ("table.md", "results.json", "resilience.png", "resilience.svg", "improvement.png")
+    assert all((out / name).stat().st_size > 500 for name in (*names, "improvement.svg"))
+    found = results_of(out)
+    assert [(row["condition"], row["method"], row["seeds"]) for row in found["rows"]] == [
+        (condition, method, seeds)
+        for condition in ("crash-free", "1 crashed", "rate 0.1", "rate 0.1, re-weighted")
+        for method, seeds in (("qmix", [0, 1, 2]), ("vdn", [10, 11, 12]))
+    ]
+    for row in found["rows"]:
+        mean = sum(row["success"]) / 3
+        assert row["interval"]["low"] <= mean <= row["interval"]["high"]
+    reweighted = found["rows"][-1]
+    free, one = (found["rows"][k]["success"] for k in (1, 3))
+    # Two robots: both crashed was not measured and counts as a failure.
+    expected = [0.81 * a + 0.18 * b for a, b in zip(free, one, strict=True)]
+    assert reweighted["success"] == pytest.approx(expected)
+    assert reweighted["not_measured"] == pytest.approx(0.01)
+    assert {each["condition"] for each in found["improvements"]} == {
+        "crash-free", "1 crashed", "rate 0.1",
+    }  # fmt: skip
+    assert found["runs"][0]["wall_s"] == 80.0
+    text = (out / "table.md").read_text()
+    assert "| map | condition | qmix | vdn |" in text
+    assert "not measured (probability 1.0 %) count as failures" in text
+    assert text in capsys.readouterr().out
+
+
+def test_it_goes_on_where_it_was_left_and_repeats_every_digit(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    one = runs / "qmix-s1"
+    report([one], out=first, episodes=4, crashed=[0])
+    capsys.readouterr()
+    report([one], out=first, episodes=4, crashed=[1, 0])
+    assert f"{one} on buttons: 1 crashed" in (said := capsys.readouterr().out)
+    assert f"{one} on buttons: crash-free" not in said
+    report([one], out=second, episodes=4, crashed=[1, 0])
+    for name in ("table.md", "results.json", "resilience.svg"):
+        assert (first / name).read_bytes() == (second / name).read_bytes()
+
+    # Other weights under the same name, other episodes: nothing old is taken for them.
+    capsys.readouterr()
+    report([one], out=first, episodes=5, crashed=[0])
+    assert "crash-free" in capsys.readouterr().out.splitlines()[0]
+    (first / "evaluations" / "qmix-s1.json").write_text('{"a": {"successes": 1}}')
+    with pytest.raises(RunError, match=r"qmix-s1\.json is damaged, delete it"):
+        report([one], out=first, episodes=5, crashed=[0])
+
+
+def test_a_single_seed_has_wilsons_interval(runs: Path, tmp_path: Path) -> None:
+    report([runs / "vdn-s0"], out=tmp_path, episodes=8, crashed=[0])
+    (row,) = results_of(tmp_path)["rows"]
+    assert row["iqm"] is None
+    assert row["interval"]["high"] - row["interval"]["low"] > 0.2
+    text = (tmp_path / "table.md").read_text()
+    assert "Wilson's interval over its episodes" in text
+    assert "## Methods" not in text
+    assert not (tmp_path / "resilience.png").exists()
+
+
+def test_one_episode_per_run_counts_over_seeds(runs: Path, tmp_path: Path) -> None:
+    folders = [runs / f"qmix-s{seed}" for seed in range(3)]
+    report(folders, out=tmp_path, episodes=1, crashed=[0], each_robot=True, mode="stay")
+    found = results_of(tmp_path)["rows"]
+    assert [row["condition"] for row in found] == ["crash-free", "robot_1 stay", "robot_2 stay"]
+    # Wilson over three seeds, not Student's t, which has no width here.
+    assert found[0]["success"] == [0.0] * 3
+    assert found[0]["interval"]["high"] == pytest.approx(0.5615, abs=1e-4)
+
+
+def test_maps_are_also_taken_together(tmp_path: Path) -> None:
+    for scenario in ("buttons", "coverage"):
+        for seed in range(2):
+            write_run(tmp_path / f"{scenario}-s{seed}", scenario, seed)
+    report([tmp_path], out=tmp_path / "report", episodes=2, crashed=[0], trajectories=None)
+    found = results_of(tmp_path / "report")["rows"]
+    names = [(row["scenario"], row["method"]) for row in found]
+    assert names == [("buttons", "qmix"), ("coverage", "qmix"), ("all maps", "qmix")]
+    assert found[2]["interval"] is None
+    assert found[2]["iqm"] is not None
+    with pytest.raises(CliError, match="--trajectories 0: runs of that seed on one map; found: b"):
+        report([tmp_path], out=tmp_path / "report", episodes=2, crashed=[0], trajectories=0)
+
+
+@pytest.mark.parametrize(
+    ("folder", "scenario", "coach", "name"),
+    [
+        ("adaptive-s3", "buttons", "adaptive", "adaptive"),
+        ("rho", "buttons", "adaptive", "rho"),
+        ("3m-s0", "skirmish/3m", "none", "qmix"),
+        ("3m-s0", "skirmish/3m", "adaptive", "qmix, adaptive"),
+        ("3m-fix_0.05-s12", "skirmish/3m", "fixed", "fix_0.05"),
+        ("fix-8m-s1", "maps/8m.yaml", "fixed", "fix"),
+        ("83m-s1", "skirmish/3m", "none", "83m"),
+    ],
+)
+def test_method_names(folder: str, scenario: str, coach: str, name: str) -> None:
+    settings = {"learner": {"algorithm": "qmix"}, "coach": {"strategy": coach}}
+    assert method_name(Path("runs") / folder, scenario, settings) == name
+
+
+def test_one_name_for_two_settings_is_told_apart_by_the_folder_above(tmp_path: Path) -> None:
+    write_run(tmp_path / "rmsprop" / "qmix-s0")
+    write_run(tmp_path / "adam" / "qmix-s0", learner={"optimiser": "adam"})
+    found = read_runs(find_runs([tmp_path / "rmsprop", tmp_path / "adam"]))
+    assert [run.method for run in found] == ["rmsprop/qmix", "adam/qmix"]
+
+
+def test_runs_that_cannot_be_seeds_of_one_method_are_refused(tmp_path: Path) -> None:
+    write_run(tmp_path / "qmix-s0")
+    write_run(tmp_path / "qmix-s1", seed=1, learner={"lr": 0.001})
+    with pytest.raises(RunError, match=r"learner\.lr is 0\.0005 in one and 0\.001 in the other"):
+        read_runs(find_runs([tmp_path]))
+    shutil.rmtree(tmp_path / "qmix-s1")
+    shutil.copytree(tmp_path / "qmix-s0", tmp_path / "qmix-s1")
+    with pytest.raises(RunError, match="both 'qmix' on buttons with seed 0"):
+        read_runs(find_runs([tmp_path]))
+
+
+def test_unfinished_runs_and_uneven_lengths_are_named(tmp_path: Path) -> None:
+    write_run(tmp_path / "qmix-s0", steps=100)
+    write_run(tmp_path / "qmix-s1", seed=1)
+    report([tmp_path], out=tmp_path / "report", episodes=2, crashed=[0])
+    text = (tmp_path / "report" / "table.md").read_text()
+    assert f"{tmp_path / 'qmix-s0'} is not finished: 100 of 200 steps." in text
+    assert "The seeds of qmix on buttons were not trained alike: 100, 200 steps." in text
+
+
+def test_collect_keeps_what_a_report_needs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = write_run(tmp_path / "runs" / "qmix-s0")
+    write_run(tmp_path / "runs" / "qmix-s1", seed=1, steps=150)
+    prepare_run(
+        tmp_path / "runs" / "qmix-s2",
+        TrainConfig.model_validate({"scenario": "buttons"}),
+        resume=False,
+    )
+    kept = tmp_path / "results" / "qmix-s0"
+    for _ in range(2):  # a copy made before is replaced
+        collect(tmp_path / "runs", tmp_path / "results")
+    said = capsys.readouterr().out
+    assert "qmix-s1: not finished: checkpoint at 150 of 200 steps" in said
+    assert "qmix-s2: not finished: checkpoint at 0 of" in said
+    assert [path.name for path in kept.parent.iterdir()] == ["qmix-s0"]
+    assert (
+        gzip.decompress((kept / "timing.jsonl.gz").read_bytes())
+        == (run / "timing.jsonl").read_bytes()
+    )
+    assert wall_time_s(kept) == wall_time_s(run) == 80.0
+
+    for folder, out in ((run, tmp_path / "a"), (kept, tmp_path / "b")):
+        report([folder], out=out, episodes=2, crashed=[0, 1])
+    strip = [
+        (folder / "table.md").read_text().replace(str(run), str(kept))
+        for folder in (tmp_path / "a", tmp_path / "b")
+    ]
+    assert strip[0] == strip[1]
+
+
+def test_collect_never_removes_what_is_no_copy(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "runs" / "qmix-s0")
+    mine = tmp_path / "results" / "qmix-s0"
+    mine.mkdir(parents=True)
+    (mine / "thesis.tex").write_text("years of work")
+    for results in (tmp_path / "results", run.parent):
+        with pytest.raises(RunError, match="choose another folder for the results"):
+            collect(run, results)
+    assert (mine / "thesis.tex").exists()
+    assert (run / "checkpoints").exists()
+    write_run(tmp_path / "other" / "qmix-s0", steps=1)
+    with pytest.raises(CliError, match="none of its runs is finished"):
+        collect(tmp_path / "other", tmp_path / "new")
+
+
+@pytest.mark.parametrize(
+    ("crashed", "rates", "each_robot", "names"),
+    [
+        (
+            None, None, False,
+            ["crash-free", "1 crashed", "2 crashed", "rate 0.01", "rate 0.05", "rate 0.1"],
+        ),
+        ([1, 0, 1], None, False, ["1 crashed", "crash-free"]),
+        (None, [0.3], False, ["rate 0.3"]),
+        ([0], [0.3], True, ["crash-free", "rate 0.3", "robot_1 mute", "robot_2 mute"]),
+    ],
+)  # fmt: skip
+def test_conditions(
+    crashed: Sequence[int] | None,
+    rates: Sequence[float] | None,
+    each_robot: bool,
+    names: list[str],
+) -> None:
+    found = asked(("robot_1", "robot_2"), crashed, rates, each_robot, "mute", {})
+    assert [condition.name for condition in found] == names
+
+
+def test_bad_input(runs: Path, tmp_path: Path) -> None:
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    blocked = tmp_path / "blocked"
+    blocked.write_text("a file")
+    bare = tmp_path / "bare-s0"
+    prepare_run(bare, TrainConfig.model_validate({"scenario": "buttons"}), resume=False)
+    one = runs / "qmix-s0"
+    cases: list[tuple[list[Path], dict[str, Any], str]] = [
+        ([], {}, "nothing to report on"),
+        ([empty], {}, r"neither a run nor a folder of runs"),
+        ([tmp_path / "none"], {}, r"neither a run nor a folder of runs"),
+        ([bare], {}, r"bare-s0 holds no checkpoint"),
+        ([one], {"crashed": [3]}, "--crashed 3: the team has 2 robots"),
+        ([one], {"crash_rate": [2.0]}, "--crash-rate 2"),
+        ([one], {"mode": "sulk"}, "--mode sulk"),
+        ([one], {"out": blocked}, "--out .*blocked: File exists"),
+    ]
+    for folders, options, text in cases:
+        arguments = {"out": tmp_path / "report", "episodes": 2, "crashed": [0], **options}
+        with pytest.raises(UserError, match=text):
+            report(folders, **arguments)
