@@ -90,6 +90,26 @@ def test_lock_step_over_ros_is_bit_for_bit_the_run_in_this_process(
     assert load_policy(run).scenario == "buttons"
 
 
+@pytest.mark.soak
+def test_lock_step_killed_and_resumed_is_as_if_it_had_never_stopped(tmp_path: Path) -> None:
+    changes = {"coach": {"strategy": "fixed", "crash_rate": 0.3}, "total_steps": 1000}
+    core = InProcess(small(seed=3, **changes))
+    core.go()
+    run, log = tmp_path / "run", tmp_path / "log"
+    command = [sys.executable, "-m", "crash_coach_bringup.cli.main", "train-live", "live/buttons"]
+    command += ["--out", str(run), "--seed", "3", "--resume", "--set", *overrides(**changes)]
+    saved = run / "checkpoints"
+    with log.open("wb") as file, subprocess.Popen(command, stdout=file, stderr=file) as child:
+        until(lambda: saved.is_dir() and any(saved.iterdir()), "a checkpoint", log)
+        child.kill()
+    assert len(metrics(run)) < len(core.lines)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert metrics(run) == core.lines
+    newest = sorted(saved.iterdir())[-1]
+    assert (newest / "agent.safetensors").read_bytes() == core.session.agent
+
+
 # --- a trainer that dies --------------------------------------------------------------------
 
 
