@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import json
 import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "bags"))
+from bag_maker import Team, messages, played, write
+
+from crash_coach_bringup.cli.main import main
 from crash_coach_bringup.ros.probe import find_executable
 from policy_pkg.train.evaluate import Scripted, evaluate, exactly, named
 from policy_pkg.untrained import write_untrained
@@ -55,6 +62,61 @@ def test_it_draws_a_trained_team_on_its_own_scenario(tmp_path: Path) -> None:
     write_untrained(run, make_env("buttons", 1).spec, seed=1)
     render(str(run), "--out", str(tmp_path / "still.png"))
     assert (tmp_path / "still.png").read_bytes().startswith(b"\x89PNG")
+
+
+Here = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Here:
+    """The command line in this process: exit code, and all that it printed."""
+
+    def run(*arguments: str) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["crash-coach", *arguments])
+        code = 0
+        try:
+            main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+        return code, "".join(capsys.readouterr())
+
+    return run
+
+
+def test_it_draws_a_recorded_episode(tmp_path: Path, here: Here) -> None:
+    team = Team("skirmish/3m")
+    bag = str(write(tmp_path / "bag", team, messages(played(team, 2))))
+    out, report = tmp_path / "still.png", tmp_path / "still.json"
+    code, text = here("render", bag, "--episode", "1", "--out", str(out), "--json", str(report))
+    assert code == 0, text
+    assert "episode 1: no success" in text
+    assert out.read_bytes().startswith(b"\x89PNG")
+    told = json.loads(report.read_text())
+    assert (told["recording"], told["seed"], told["episode"]) == (bag, 3, 1)
+    assert told["trajectory_hash"] == team.session.trajectory_hash
+    assert told["modes"] == ["mute", "random"]
+    some = ("--out", str(tmp_path / "x.png"))
+    code, text = here("render", bag, "--episode", "7", *some)
+    assert (code, "no complete episode 7; complete: 0..1" in text) == (1, True), text
+    code, text = here("render", bag, "--victims", "robot_1", *some)
+    assert (code, "--victims has no meaning with a recording" in text) == (1, True), text
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["bag", "still.json", "still.png"]
+
+
+def test_a_recording_of_an_unknown_scenario_is_named(tmp_path: Path, here: Here) -> None:
+    team = Team()
+    sent = team.play().sent
+    lab = replace(team.about, scenario="lab.yaml")
+    elsewhere = str(write(tmp_path / "a", team, sent, about=lab))
+    some = ("--out", str(tmp_path / "x.png"))
+    code, text = here("render", elsewhere, *some)
+    assert code == 1
+    assert "recorded with a scenario that is not here" in text
+    assert "lab.yaml" in text
+    assert here("render", elsewhere, "--scenario", "buttons", *some)[0] == 0
+    untold = str(write(tmp_path / "b", team, sent, about=replace(team.about, scenario="")))
+    code, text = here("render", untold, *some)
+    assert (code, "does not name its scenario" in text) == (1, True), text
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,11 @@ def find_bags(paths: Sequence[Path]) -> list[Bag]:
     return list(bags.values())
 
 
+def holds_bags(path: Path) -> bool:
+    """Whether ``find_bags`` would find a recording there."""
+    return bool(_below(path))
+
+
 def _below(path: Path) -> list[Bag]:
     if path.is_file() and path.suffix == ".mcap":
         return [Bag(str(path), (path,))]

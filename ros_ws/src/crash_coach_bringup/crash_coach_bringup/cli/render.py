@@ -1,7 +1,8 @@
-"""`crash-coach render`: an episode as a film or a picture."""
+"""`crash-coach render`: an episode, played or recorded, as a film or a picture."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,10 +22,14 @@ from crash_coach_bringup.cli.output import (
     write_json,
 )
 from crash_coach_bringup.cli.target import HELP, load_target
+from policy_pkg.bags.bag import holds_bags
 from policy_pkg.train.evaluate import Condition, record
+from policy_pkg.train.playback import play_back, read_episode
+from sim_pkg.config import ConfigError
 from sim_pkg.frames import Frames
 
 FILMS, STILLS = (".mp4", ".gif"), (".png",)
+OF_A_TEAM = ("seed", "crash_rate", "crashed", "victims", "mode", "param")
 
 
 def check_out(out: Path) -> None:
@@ -57,14 +62,12 @@ def draw(frames: Frames, out: Path, speed: float) -> None:
         raise CliError(f"--out: {out} cannot be written: {error.strerror}") from None
 
 
-def report(frames: Frames, condition: Condition) -> dict[str, Any]:
+def outcome(frames: Frames) -> dict[str, Any]:
     """JSON values: which episode it is, and how it ended."""
     return {
         "scenario": frames.scenario,
         "seed": frames.seed,
         "episode": frames.episode,
-        "condition": condition.name,
-        "crash": condition.crash.model_dump(mode="json"),
         "crashed": list(frames.faulted),
         "success": frames.success,
         "steps": frames.steps,
@@ -73,14 +76,63 @@ def report(frames: Frames, condition: Condition) -> dict[str, Any]:
     }
 
 
+def show(frames: Frames, out: Path) -> None:
+    who = ", ".join(frames.actors[i].name for i in frames.faulted) or "nobody"
+    done = "success" if frames.success else "no success"
+    told = f"episode {frames.episode}: {done} after {frames.steps} steps; crashed: {who}"
+    console.print(told, highlight=False)
+    console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
+
+
+def is_recording(name: str) -> bool:
+    """Whether it is meant as one: bags.bag tells what is wrong with those that cannot be read."""
+    path = Path(name)
+    if path.is_file():
+        return path.suffix in (".mcap", ".db3")
+    return path.is_dir() and ((path / "metadata.yaml").exists() or holds_bags(path))
+
+
+def recorded(name: str, episode: int | None, scenario: str | None) -> tuple[Frames, dict[str, Any]]:
+    """A recorded episode played again, and JSON values of what was recorded.
+
+    Raises:
+        BagError: no such recording or episode.
+        CliError: the scenario is not told, or not known here.
+        UserError: it gives another trajectory here.
+    """
+    found, about = read_episode(Path(name), episode)
+    told = about.scenario if about is not None else ""
+    chosen = scenario or told
+    if not chosen:
+        raise CliError(f"{name}: the recording does not name its scenario: --scenario is needed")
+    try:
+        frames = play_back(found, chosen)
+    except ConfigError as error:
+        if scenario is not None:
+            raise
+        raise CliError(
+            f"{name}: recorded with a scenario that is not here ({error}); --scenario FILE names it"
+        ) from None
+    return frames, {"recording": name, "modes": sorted(set(found.modes.values()))}
+
+
 def render(
-    team: Annotated[str, typer.Argument(metavar="TEAM", help=HELP)],
+    context: typer.Context,
+    team: Annotated[str, typer.Argument(metavar="TEAM", help=f"{HELP[:-1]}; or a recording.")],
     out: Annotated[Path, typer.Option(help="A .mp4 or .gif film, or a .png picture.")],
     scenario: Annotated[
-        str | None, typer.Option(help="Scenario name or YAML file; default: the trained team's.")
+        str | None,
+        typer.Option(help="Scenario name or YAML file; default: the trained team's, the recorded."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed, as of evaluate.", min=0)] = 0,
-    episode: Annotated[int, typer.Option(help="Its number.", min=0, max=2**32 - 1)] = 0,
+    episode: Annotated[
+        int | None,
+        typer.Option(
+            help="Its number; default: 0, of a recording the first that is complete.",
+            min=0,
+            max=2**32 - 1,
+        ),
+    ] = None,
     crash_rate: Annotated[
         float | None, typer.Option(help="Each robot crashes with this probability.")
     ] = None,
@@ -91,22 +143,52 @@ def render(
     speed: Annotated[float, typer.Option(help="Of a film, times real time.")] = 1.0,
     json: Annotated[Path | None, typer.Option(help="Also write what happened here.")] = None,
 ) -> None:
-    """Draws an episode of a team; the same episode that evaluate plays. Needs no display."""
+    """Draws an episode: of a team the one that evaluate plays, of a recording the one recorded.
+
+    Needs no display. A recorded episode is played again from its seed and the actions that were
+    executed, and drawn only where that gives the recorded trajectory, bit for bit.
+    """
     check_json_target(json)
     check_out(out)
     if not 0.01 <= speed <= 1000:
         raise CliError(f"--speed {speed}: 0.01 to 1000 times real time")
-    parameters = mode_parameters(mode, param or [])
-    target = load_target(team, scenario)
+    if is_recording(team):
+        refuse_options_of_a_team(context)
+        frames, which = recorded(team, episode, scenario)
+    else:
+        parameters = mode_parameters(mode, param or [])
+        target = load_target(team, scenario)
+        condition = one_condition(target.robots, crash_rate, crashed, victims, mode, parameters)
+        first = episode or 0
+        (frames,) = record(target.team, target.scenario, condition, range(first, first + 1), seed)
+        crash = condition.crash.model_dump(mode="json")
+        which = {"team": team, "condition": condition.name, "crash": crash}
+    draw(frames, out, speed)
+    show(frames, out)
+    write_json(json, {**which, **outcome(frames), "file": str(out)})
+
+
+def refuse_options_of_a_team(context: typer.Context) -> None:
+    """Raises CliError for what a recording has settled."""
+    for name in OF_A_TEAM:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name != "DEFAULT":
+            option = name.replace("_", "-")
+            raise CliError(f"--{option} has no meaning with a recording: it says who crashed how")
+
+
+def one_condition(
+    robots: tuple[str, ...],
+    crash_rate: float | None,
+    crashed: int | None,
+    victims: list[str] | None,
+    mode: str,
+    parameters: Mapping[str, float],
+) -> Condition:
+    """Raises CliError where more than one is asked for."""
     rates = [] if crash_rate is None else [crash_rate]
     counts = [] if crashed is None else [crashed]
-    asked = conditions(target.robots, rates, counts, victims or [], mode, parameters)
+    asked = conditions(robots, rates, counts, victims or [], mode, parameters)
     if len(asked) > 1:
         raise CliError("--crash-rate, --crashed, --victims: an episode is played under one of them")
-    (frames,) = record(target.team, target.scenario, asked[0], range(episode, episode + 1), seed)
-    draw(frames, out, speed)
-    who = ", ".join(target.robots[i] for i in frames.faulted) or "nobody"
-    done = "success" if frames.success else "no success"
-    console.print(f"{done} after {frames.steps} steps; crashed: {who}", highlight=False)
-    console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
-    write_json(json, {"team": team, **report(frames, asked[0]), "file": str(out)})
+    return asked[0]
