@@ -20,18 +20,11 @@ def greedy(q: FloatArray, available: BoolArray) -> IntArray:
 
 
 def least_valued(q: FloatArray, available: BoolArray) -> IntArray:
-    """As ``greedy``, (...) the worst available action, the first of equals."""
+    """As ``greedy``, (...) the worst available action, the first of equals: what an adversarial
+    fault executes."""
     masked = np.where(available, q, np.float32(np.inf))
     worst: IntArray = masked.argmin(axis=-1).astype(np.int32)
     return worst
-
-
-def worst(q: FloatArray, available: BoolArray) -> IntArray:
-    """(..., A) values and availability -> (...) the least valued available action, the first of
-    equals: what an adversarial fault executes."""
-    masked = np.where(available, q, np.float32(np.inf))
-    least: IntArray = masked.argmin(axis=-1).astype(np.int32)
-    return least
 
 
 def epsilon_greedy(

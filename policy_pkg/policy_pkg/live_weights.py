@@ -9,7 +9,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load
 
-from policy_pkg.act import Exploration, greedy, worst
+from policy_pkg.act import Exploration, greedy, least_valued
 from policy_pkg.agent import Agent
 from policy_pkg.policy import RecurrentPolicy, WeightArrays, check_weights
 from sim_pkg.contract import UserError
@@ -88,7 +88,7 @@ class LiveAgent(Generic[Stamp]):
             first.obs_size,
             first.n_actions,
             greedy,
-            worst,
+            least_valued,
         )
         self.agent.exploration = first.exploration
         self._held: list[Weights] = []  # for later episodes, in the order of their arrival

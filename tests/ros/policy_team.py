@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from policy_pkg.act import greedy, worst
+from policy_pkg.act import greedy, least_valued
 from policy_pkg.agent import Agent, Answer, Sensed
 from policy_pkg.checkpoint import PolicyBundle
 from sim_pkg.contract import EnvSpec
@@ -37,4 +37,4 @@ def actions(answers: list[Answer[str]]) -> list[int]:
 
 
 def make_agent(bundle: PolicyBundle, robots: tuple[str, ...] = SPEC.robots) -> Agent[str]:
-    return Agent(bundle.policy, bundle.robots, robots, OBS, ACTIONS, greedy, worst)
+    return Agent(bundle.policy, bundle.robots, robots, OBS, ACTIONS, greedy, least_valued)

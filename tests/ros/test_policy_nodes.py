@@ -206,6 +206,8 @@ def test_an_observation_of_another_size_ends_the_policy(
         ("team", {"checkpiont": "x"}, "unknown parameter 'checkpiont' of team; known: checkpoint"),
         ("team", {"checkpoint": "/no/where"}, "/no/where: no such file or directory"),
         ("team", {"checkpoint": 3}, "checkpoint"),
+        ("team", {"checkpoint": "HERE", "epsilon": 1.5}, "parameter epsilon = 1.5: Input should"),
+        ("team", {"live": True, "epsilon": 0.5}, "parameter 'epsilon' of team has no meaning with"),
         ("policy", {"checkpoint": "HERE"}, "'robot' of policy is missing"),
         ("policy", {"checkpoint": "HERE", "robot": "robot_9"}, "robot 'robot_9' is not of"),
     ],
@@ -214,7 +216,7 @@ def test_bad_parameters_are_one_line_and_exit_code_1(
     checkpoint: Path,
     ros_env: dict[str, str],
     executable: str,
-    parameters: dict[str, str | int],
+    parameters: dict[str, str | int | float],
     message: str,
 ) -> None:
     filled = {k: str(checkpoint) if v == "HERE" else v for k, v in parameters.items()}

@@ -93,7 +93,8 @@ class Keyed(np.random.Generator):
 
     def random(self, size: tuple[int, int, int]) -> npt.NDArray[np.float64]:  # type: ignore[override]
         key = np.array([SEED ^ 0xE8910, self.episode], dtype=np.uint64)
-        return np.random.Generator(np.random.Philox(key, [0, self.step, 0, 0])).random(size)
+        bits = np.random.Philox(key=key, counter=[0, self.step, 0, 0])
+        return np.random.Generator(bits).random(size)
 
 
 def rolled_out(
@@ -135,7 +136,7 @@ def check_recording(
     folder: Path, domain: int, crash: CoachConfig, episodes: int, epsilon: float = 0.0
 ) -> None:
     bag = record(folder, domain, crash, episodes, epsilon)
-    expected = rolled_out(folder / "team" / "step_0", crash, episodes)
+    expected = rolled_out(folder / "team" / "step_0", crash, episodes, epsilon)
     check_bag(bag, expected)
     check_bag(shuffled(bag, folder / "shuffled"), expected)
 

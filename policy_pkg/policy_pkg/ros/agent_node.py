@@ -12,7 +12,6 @@ from types import FrameType
 
 import rclpy
 from crash_coach_interfaces.msg import Action, Observation
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.context import Context
 from rclpy.exceptions import ParameterException
 from rclpy.experimental import EventsExecutor
@@ -22,9 +21,10 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
-from policy_pkg.act import greedy, worst
+from policy_pkg.act import Exploration, greedy, least_valued
 from policy_pkg.agent import Agent
 from policy_pkg.checkpoint import CheckpointError, load_policy
+from policy_pkg.ros.agent_params import PolicyParameters, TeamParameters, read_parameters
 from policy_pkg.ros.convert import bytes_from_answer, sensed_from_bytes
 from policy_pkg.ros.weights_link import Receive, WeightsLink
 from sim_pkg.contract import UserError
@@ -43,32 +43,27 @@ class AgentNode(Node):
 
     def __init__(self, name: str, one_robot: bool, context: Context | None = None) -> None:
         super().__init__(name, context=context)
-        robot = self._text("robot", "robot that this policy drives") if one_robot else None
-        checkpoint = self._text("checkpoint", "run directory or checkpoint directory; see live")
-        live = self._flag("live", "act on the weights of a trainer instead of a checkpoint")
-        command_topic = self._text("command_topic", "answers go to /<robot>/<this>", "command_raw")
-        observation_topic = self._text(
-            "observation_topic",
-            "acts on /<robot>/<this>; observation_seen where the gate relays observations",
-            "observation",
-        )
-        self._check_parameters({"checkpoint"} if live else set())
-        self._topics = (observation_topic, command_topic)
+        parameters = read_parameters(self, PolicyParameters if one_robot else TeamParameters)
+        robots = (parameters.robot,) if isinstance(parameters, PolicyParameters) else ()
+        self._topics = (parameters.observation_topic, parameters.command_topic)
         self._commands: list[Publisher] = []
         self.failure: UserError | None = None
         """Why the node has to end; an exception in a callback would be told with a traceback."""
-        if live:
-            self._link = WeightsLink(self, () if robot is None else (robot,), self._act_for)
+        if parameters.live:
+            self._link = WeightsLink(self, robots, self._act_for)
             return
-        bundle = load_policy(checkpoint)
+        bundle = load_policy(parameters.checkpoint)
         agent: Agent[bytes] = Agent(
             bundle.policy,
             bundle.robots,
-            bundle.robots if robot is None else (robot,),
+            robots or bundle.robots,
             bundle.obs_size,
             bundle.n_actions,
             greedy,
-            worst,
+            least_valued,
+        )
+        agent.exploration = Exploration(
+            parameters.epsilon, parameters.exploration_seed, len(bundle.robots)
         )
         self._act_for(agent.robots, agent.receive)
 
@@ -87,30 +82,6 @@ class AgentNode(Node):
                 NEWEST,
                 raw=True,
             )
-
-    def _text(self, name: str, description: str, default: str = "") -> str:
-        value: str = self.declare_parameter(
-            name, default, ParameterDescriptor(description=description, read_only=True)
-        ).value
-        return value
-
-    def _flag(self, name: str, description: str) -> bool:
-        value: bool = self.declare_parameter(
-            name, False, ParameterDescriptor(description=description, read_only=True)
-        ).value
-        return value
-
-    def _check_parameters(self, excess: set[str]) -> None:
-        """``excess``: those that have no meaning here and have to be empty."""
-        known = ", ".join(sorted(self._parameters))
-        for name in self._parameter_overrides:
-            if not self.has_parameter(name):
-                raise UserError(f"unknown parameter {name!r} of {self.get_name()}; known: {known}")
-        for name, parameter in self._parameters.items():
-            if name in excess and parameter.value != "":
-                raise UserError(f"parameter {name!r} of {self.get_name()} has no meaning with live")
-            if parameter.value == "" and name not in excess:
-                raise UserError(f"parameter {name!r} of {self.get_name()} is missing")
 
     def _on_observation(self, robot: int, message: bytes) -> None:
         try:

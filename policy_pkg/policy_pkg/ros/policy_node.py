@@ -8,7 +8,7 @@ from policy_pkg.ros.agent_node import AgentNode, spin
 
 
 class PolicyNode(AgentNode):
-    """Parameters: robot, checkpoint or live, command_topic, observation_topic."""
+    """Parameters: see PolicyParameters."""
 
     def __init__(self) -> None:
         super().__init__("policy", one_robot=True)

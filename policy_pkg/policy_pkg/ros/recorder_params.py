@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import re
-from typing import Any, Literal
+from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from rcl_interfaces.msg import ParameterDescriptor
+from pydantic import BaseModel, ConfigDict, Field
 from rclpy.node import Node
 
+from policy_pkg.ros.node_params import read_model, require
 from sim_pkg.contract import UserError
 
-_OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides")
 _NOT_TOLD = -1
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
@@ -45,27 +44,8 @@ def read_parameters(node: Node) -> RecorderParameters:
     Raises:
         UserError: an unknown name, a wrong type, a value out of range, or no out or robots.
     """
-    known = RecorderParameters.model_fields
-    for name in node._parameter_overrides:
-        if name not in known and name.split(".")[0] not in _OF_RCLPY:
-            raise UserError(f"unknown parameter {name!r} of recorder; known: {', '.join(known)}")
-    values: dict[str, Any] = {}
-    for name, about in known.items():
-        # Typed by the model, which says more than a type mismatch in rclpy does.
-        descriptor = ParameterDescriptor(
-            description=about.description, read_only=True, dynamic_typing=True
-        )
-        value = node.declare_parameter(name, about.default, descriptor).value
-        values[name] = value if isinstance(value, str | int | float) else list(value)
-    try:
-        parameters = RecorderParameters.model_validate(values)
-    except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        name = ".".join(map(str, problem["loc"]))
-        raise UserError(f"parameter {name} = {problem['input']!r}: {problem['msg']}") from error
-    for name in ("out", "robots"):
-        if getattr(parameters, name) in ("", [""]):
-            raise UserError(f"parameter {name!r} of recorder is missing: {known[name].description}")
+    parameters = read_model(node, RecorderParameters)
+    require(node, parameters, "out", "robots")
     robots = parameters.robots
     if len(set(robots)) != len(robots) or not all(map(_NAME.fullmatch, robots)):
         raise UserError(

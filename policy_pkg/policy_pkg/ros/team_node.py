@@ -8,7 +8,7 @@ from policy_pkg.ros.agent_node import AgentNode, spin
 
 
 class TeamNode(AgentNode):
-    """Parameters: checkpoint or live, command_topic, observation_topic.
+    """Parameters: see TeamParameters.
 
     The checkpoint, or the trainer's weights, name the robots.
     """

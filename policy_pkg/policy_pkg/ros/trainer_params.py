@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from rcl_interfaces.msg import ParameterDescriptor
+from pydantic import BaseModel, ConfigDict, Field
 from rclpy.node import Node
 
+from policy_pkg.ros.node_params import read_model, require
 from sim_pkg.contract import UserError
 
-_OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides")
 OWN_DOMAIN = -1
 NOTHING = "none"
 
@@ -40,27 +39,8 @@ def read_parameters(node: Node) -> TrainerParameters:
     Raises:
         UserError: an unknown name, a wrong type, a value out of range, or no config or out.
     """
-    known = TrainerParameters.model_fields
-    for name in node._parameter_overrides:
-        if name not in known and name.split(".")[0] not in _OF_RCLPY:
-            raise UserError(f"unknown parameter {name!r} of trainer; known: {', '.join(known)}")
-    values = {}
-    for name, about in known.items():
-        # Typed by the model, which says more than a type mismatch in rclpy does.
-        descriptor = ParameterDescriptor(
-            description=about.description, read_only=True, dynamic_typing=True
-        )
-        value = node.declare_parameter(name, about.default, descriptor).value
-        values[name] = value if isinstance(value, str | int | float) else list(value)
-    try:
-        parameters = TrainerParameters.model_validate(values)
-    except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        name = ".".join(map(str, problem["loc"]))
-        raise UserError(f"parameter {name} = {problem['input']!r}: {problem['msg']}") from error
-    for name in ("config", "out"):
-        if not getattr(parameters, name):
-            raise UserError(f"parameter {name!r} of trainer is missing: {known[name].description}")
+    parameters = read_model(node, TrainerParameters)
+    require(node, parameters, "config", "out")
     if len(set(parameters.domains)) != len(parameters.domains):
         raise UserError(f"parameter domains = {parameters.domains}: a domain comes twice")
     return parameters

@@ -8,6 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from crash_coach_bringup.cli.evaluate import Layout, LayoutOption
+from crash_coach_bringup.cli.output import CliError
+from policy_pkg.train.evaluate import at_rate, crash_free
+
 if TYPE_CHECKING:
     from crash_coach_bringup.ros.supervisor import Event
 
@@ -29,11 +33,18 @@ def up(
     mode: Annotated[
         Mode, typer.Option(help="As fast as every robot answers, or by the clock.")
     ] = Mode.lockstep,
-    team_process: Annotated[
-        bool, typer.Option("--team-process", help="All policies in one process.")
-    ] = False,
+    layout: LayoutOption = Layout.nodes,
     episodes: Annotated[int, typer.Option(help="End after this many; 0: run on.", min=0)] = 0,
-    seed: Annotated[int, typer.Option(help="Seed of episodes and crashes.", min=0)] = 0,
+    seed: Annotated[
+        int, typer.Option(help="Seed of episodes, crashes and random actions.", min=0)
+    ] = 0,
+    epsilon: Annotated[
+        float,
+        typer.Option(help="Probability of a random action, per robot and step; 1: a random team."),
+    ] = 0.0,
+    crash_rate: Annotated[
+        float, typer.Option(help="Each robot is mute in an episode with this probability.")
+    ] = 0.0,
     relay_observations: Annotated[
         bool,
         typer.Option(
@@ -43,7 +54,10 @@ def up(
     ] = False,
     logs: Annotated[Path, typer.Option(help="Folder for the nodes' logs.")] = Path("runs/up"),
 ) -> None:
-    """Starts sim, policies, gate and coach, one process each, until Ctrl-C or a node dies."""
+    """Starts sim, policies, gate and coach until the last episode, Ctrl-C, or a node's death."""
+    for name, value in (("epsilon", epsilon), ("crash-rate", crash_rate)):
+        if not 0 <= value <= 1:
+            raise CliError(f"--{name} {value}: a probability from 0 to 1 is needed")
     from crash_coach_bringup.ros.graph import UpOptions
     from crash_coach_bringup.ros.up import run_up
 
@@ -51,9 +65,11 @@ def up(
         scenario=scenario,
         checkpoint=policy,
         mode="lockstep" if mode is Mode.lockstep else "realtime",
-        layout="team" if team_process else "nodes",
+        layout=layout.value,
         episodes=episodes,
         seed=seed,
+        epsilon=epsilon,
+        coach=(at_rate(crash_rate) if crash_rate > 0 else crash_free()).crash,
         relay_observations=relay_observations,
         log_dir=logs,
     )

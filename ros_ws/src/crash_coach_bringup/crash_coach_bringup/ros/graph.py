@@ -41,7 +41,8 @@ class UpOptions:
     ``relay_observations``: observations pass through the gate, so that faults of them can be
     injected later; where the coach starts with such faults, they do anyway. ``gate`` false leaves
     coach and gate out: the policies command the robots directly. ``checkpoint`` None: a trainer
-    gives the policies their weights, and the coach its success rates.
+    gives the policies their weights, and the coach its success rates. ``epsilon``: with this
+    probability, per robot and step, a policy takes a random action, keyed by ``seed``.
     """
 
     scenario: str
@@ -52,6 +53,7 @@ class UpOptions:
     episodes: int = 0  # 0: endless
     autostart: bool = True
     gate: bool = True
+    epsilon: float = 0.0
     coach: CoachConfig = field(default_factory=CoachConfig)
     fault_scenario: Path | None = None
     relay_observations: bool = False
@@ -175,6 +177,7 @@ def graph_nodes(options: UpOptions, team: TeamSpec) -> list[Node]:
         acting["live"] = True
     else:
         acting["checkpoint"] = str(options.checkpoint.resolve())
+        acting |= {"epsilon": float(options.epsilon), "exploration_seed": options.seed}
     relays = relays_observations(options)
     if relays:
         acting["observation_topic"] = "observation_seen"
