@@ -11,6 +11,7 @@ from crash_coach_pkg.action_tools import ACTION_OFFERS
 from crash_coach_pkg.coach import BlockRecord, Coach
 from crash_coach_pkg.config import TeamSpec
 from crash_coach_pkg.faults import unmet_needs
+from crash_coach_pkg.plan import CrashPlan
 from crash_coach_pkg.strategies import Progress
 from policy_pkg.policy import RecurrentPolicy
 from policy_pkg.train.config import TrainConfig
@@ -136,7 +137,7 @@ class Session:
         self.replay = Replay(config.replay_episodes, sizes)
         self.sampling = generator(config.seed, SAMPLING)
         exploration = generator(config.seed, EXPLORATION)
-        self.rollout = Rollout(self.env, self.policy, self.coach.plan, config.seed, exploration)
+        self.rollout = Rollout(self.env, self.policy, self._plan, config.seed, exploration)
 
     @property
     def spec(self) -> EnvSpec:
@@ -154,6 +155,9 @@ class Session:
     @property
     def block_due(self) -> bool:
         return self.counters.block_due(self.config.total_steps)
+
+    def _plan(self, episode: int) -> CrashPlan:
+        return self.coach.plan(episode)  # looked up at each call: a profile times it
 
     def collect(self) -> None:
         """One step in every arena; learns after each episode that it ended, as PyMARL does.

@@ -78,6 +78,7 @@ def train(
     progress: Callable[[ProgressReport], None] = lambda report: None,
     clock: Clock = time.perf_counter,
     environment: MakeEnv = make_env,
+    opened: Callable[[Session], None] = lambda session: None,
 ) -> TrainSummary:
     """Trains until ``config.total_steps``.
 
@@ -87,6 +88,7 @@ def train(
             bit for bit as if it had never stopped.
         clock: monotonic, seconds.
         environment: makes the environment of a scenario with a number of arenas.
+        opened: told the session before its first step.
 
     Raises:
         UserError: the config does not fit the scenario, ``out_dir`` cannot be used, a checkpoint
@@ -100,6 +102,7 @@ def train(
     with locked(out_dir):
         trainer = _Trainer(session, out_dir, progress, clock)
         try:
+            opened(session)
             return trainer.run()
         finally:
             trainer.close()

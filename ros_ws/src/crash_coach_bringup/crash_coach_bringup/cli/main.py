@@ -17,6 +17,7 @@ from crash_coach_bringup.cli import (
     faults,
     inject,
     plot,
+    profile,
     record,
     render,
     report,
@@ -45,6 +46,7 @@ app.command("train")(train.train)
 app.command("train-live")(train_live.train_live)
 app.command("train-offline")(train_offline.train_offline)
 app.command("evaluate")(evaluate.evaluate)
+app.command("profile")(profile.profile)
 app.add_typer(faults.app, name="faults")
 app.command("up")(up.up)
 app.command("inject")(inject.inject)
