@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -13,10 +14,18 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from crash_coach_pkg.config import CoachConfig
 from policy_pkg.train.learner_config import LearnerConfig
-from sim_pkg.config import ConfigError, YamlTree, did_you_mean, load_tree, validate
+from sim_pkg.config import (
+    ConfigError,
+    YamlTree,
+    did_you_mean,
+    load_tree,
+    shipped_names,
+    validate,
+)
 
 CONFIGS_DIR = Path(__file__).parent.parent / "configs"
 OFFLINE = "offline"  # its folder is that of `train-offline`
+PAPER = "paper"  # its folder is that of `sweep`
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
@@ -89,27 +98,37 @@ def graph_seed(seed: int, graph: int) -> int:
 
 
 @dataclass(frozen=True)
+class Setting:
+    """``key=value`` or ``section.key=value``; ``place``: what an error calls it."""
+
+    key: str
+    value: Any
+    place: str
+
+
+@dataclass(frozen=True)
 class _Overridden(YamlTree):
-    """A tree in which some values come from the command line."""
+    """A tree in which some values come from elsewhere: ``overrides`` says where, by their keys."""
 
     overrides: dict[tuple[str, ...], str] = field(default_factory=dict)
 
     def where(self, location: tuple[int | str, ...]) -> str:
-        for keys, text in self.overrides.items():
+        for keys, place in self.overrides.items():
             if location[: len(keys)] == keys:
-                return f"--set {text}"
+                return place
         # A whole section is wrong: what was overridden in it may be the reason, or not.
         inside = [
-            text for keys, text in self.overrides.items() if keys[: len(location)] == location
+            place for keys, place in self.overrides.items() if keys[: len(location)] == location
         ]
-        return " with --set ".join([super().where(location), *inside])
+        return " with ".join([super().where(location), *inside])
 
 
 def config_names(offline: bool) -> tuple[str, ...]:
     """Names of the shipped configs of `train`, or of `train-offline`; sorted."""
-    files = (file.relative_to(CONFIGS_DIR) for file in CONFIGS_DIR.rglob("*.yaml"))
-    chosen = (file for file in files if (file.parts[0] == OFFLINE) is offline)
-    return tuple(sorted(file.with_suffix("").as_posix() for file in chosen))
+    folders = [(name, name.split("/")[0]) for name in shipped_names(CONFIGS_DIR)]
+    if offline:
+        return tuple(name for name, folder in folders if folder == OFFLINE)
+    return tuple(name for name, folder in folders if folder not in (OFFLINE, PAPER))
 
 
 def train_config_names() -> tuple[str, ...]:
@@ -142,12 +161,28 @@ def load_config(
     Raises:
         ConfigError: names the file and line or the override, the key, the value, what is right.
     """
-    tree = load_tree(_find(source, known))
+    given = [_parse(text) for text in [*overrides, *([] if seed is None else [f"seed={seed}"])]]
+    return validate(with_settings(load_tree(_find(source, known)), given), model)
+
+
+def load_train_tree(source: str | Path) -> YamlTree:
+    """A training config, for ``with_settings`` and ``validate``; found as by ``load_config``."""
+    return load_tree(_find(source, train_config_names()))
+
+
+def with_settings(base: YamlTree, settings: Iterable[Setting]) -> YamlTree:
+    """A copy of ``base`` with these values, later ones over earlier ones.
+
+    Raises:
+        ConfigError: a key that leads into a value.
+    """
+    values = deepcopy(base.values)
     given: dict[tuple[str, ...], str] = {}
-    for text in [*overrides, *([] if seed is None else [f"seed={seed}"])]:
-        keys = _apply(tree.values, text)
-        given[keys] = text
-    return validate(_Overridden(tree.path, tree.values, tree.lines, given), model)
+    for setting in settings:
+        keys = _apply(values, setting)
+        given.pop(keys, None)
+        given[keys] = setting.place
+    return _Overridden(base.path, values, base.lines, given)
 
 
 def _find(source: str | Path, known: tuple[str, ...]) -> Path:
@@ -163,20 +198,26 @@ def _find(source: str | Path, known: tuple[str, ...]) -> Path:
     )
 
 
-def _apply(values: dict[str, Any], text: str) -> tuple[str, ...]:
-    """Puts one override into ``values``; returns the keys that lead to it."""
+def _parse(text: str) -> Setting:
+    """A setting of the command line."""
     key, equals, value = text.partition("=")
-    keys = tuple(key.strip().split("."))
-    if not equals or not all(keys):
+    if not equals:
         raise ConfigError(f"--set {text}: expected key=value or section.key=value")
     try:
-        parsed = yaml.safe_load(value)
+        return Setting(key.strip(), yaml.safe_load(value), f"--set {text}")
     except yaml.YAMLError as error:
         raise ConfigError(f"--set {text}: {value!r} is not a YAML value") from error
+
+
+def _apply(values: dict[str, Any], setting: Setting) -> tuple[str, ...]:
+    """Puts one setting into ``values``; returns the keys that lead to it."""
+    keys = tuple(setting.key.split("."))
+    if not all(keys):
+        raise ConfigError(f"{setting.place}: expected key=value or section.key=value")
     place = values
     for part in keys[:-1]:
         place = place.setdefault(part, {})
         if not isinstance(place, dict):
-            raise ConfigError(f"--set {text}: {part!r} is a value, not a section")
-    place[keys[-1]] = parsed
+            raise ConfigError(f"{setting.place}: {part!r} is a value, not a section")
+    place[keys[-1]] = deepcopy(setting.value)
     return keys

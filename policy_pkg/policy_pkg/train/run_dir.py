@@ -58,7 +58,7 @@ def prepare_run(
         if not resume:
             raise RunError(f"{out_dir} already holds a run: resume it, or choose another directory")
         run = read_run(out_dir)
-        _check_same(run, config, described)
+        check_same(run, config, out_dir)
         _check_same_data(run, data, out_dir)
         return
     # A .partial file is what a killed process leaves.
@@ -119,14 +119,15 @@ def _commit() -> str | None:
     return done.stdout.strip() or None
 
 
-def _check_same(run: dict[str, Any], config: RunConfig, path: Path) -> None:
+def check_same(run: Mapping[str, Any], config: RunConfig, out_dir: Path) -> None:
+    """Raises RunError where ``out_dir``, which ``run`` describes, was not begun with ``config``."""
     before = flat(run.get("config", {}))
     now = flat(config.model_dump(mode="json"))
     for key in sorted({*before, *now}):
         old, new = before.get(key, "nothing"), now.get(key, "nothing")
         if old != new:
             raise RunError(
-                f"{path.parent} was started with {key} = {old!r}, not {new!r}: "
+                f"{out_dir} was started with {key} = {old!r}, not {new!r}: "
                 "a run is resumed with the config it was started with"
             )
 

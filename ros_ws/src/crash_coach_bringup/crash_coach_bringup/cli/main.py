@@ -21,6 +21,7 @@ from crash_coach_bringup.cli import (
     record,
     render,
     report,
+    sweep,
     train,
     train_live,
     train_offline,
@@ -31,6 +32,7 @@ from sim_pkg.contract import UserError
 # Options that take several values, up to the next option: --crashed 0 1 2
 SEVERAL = {
     "--crash-rate", "--crashed", "--victims", "--set", "--seed", "--policy", "--param", "--robots",
+    "--have",
 }  # fmt: skip
 
 app = typer.Typer(
@@ -45,6 +47,7 @@ app.command("doctor")(doctor.doctor)
 app.command("train")(train.train)
 app.command("train-live")(train_live.train_live)
 app.command("train-offline")(train_offline.train_offline)
+app.command("sweep")(sweep.sweep)
 app.command("evaluate")(evaluate.evaluate)
 app.command("profile")(profile.profile)
 app.add_typer(faults.app, name="faults")
