@@ -6,13 +6,11 @@ import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from crash_coach_pkg.faults import mode_code
-from crash_coach_pkg.plan import CrashPlan, Fault, Trigger, TriggerKind
 from policy_pkg.bags.about import About
 from policy_pkg.bags.assemble import (
     ContradictionError,
@@ -48,7 +46,6 @@ class RecordedEpisode:
     episode: Episode
     intents: IntArray  # (T, n) actions that the policies wanted; -1 where not recorded
     success: bool
-    plan: CrashPlan | None  # the last revision; None where not recorded
     modes: dict[tuple[int, int], str]  # names of faults by (step, robot)
     trajectory_hash: str
 
@@ -190,7 +187,7 @@ def recorded_episode(
 
     Raises:
         ContradictionError, IncompleteError: what is wrong, or missing.
-        ValueError: a plan or fault that does not exist.
+        ValueError: a fault that does not exist.
     """
     end = joined.end
     _check_hash(joined)
@@ -211,7 +208,6 @@ def recorded_episode(
         episode=episode,
         intents=joined.intents,
         success=bool(end.success),
-        plan=_plan(pieces.plan, robots) if pieces.plan is not None else None,
         modes={**joined.observed, **joined.modes},
         trajectory_hash=end.trajectory_hash,
     )
@@ -265,30 +261,3 @@ def _faults(joined: Joined, robots: tuple[str, ...], realtime: bool) -> npt.NDAr
         raise IncompleteError(f"no EFFECT event of {robots[robot]}'s step {step}, which crashed")
     codes[~joined.crashed] = 0
     return codes
-
-
-def _plan(message: Any, robots: tuple[str, ...]) -> CrashPlan:
-    """A CrashPlan message as the coach's type."""
-    return CrashPlan(
-        episode=int(message.episode),
-        revision=int(message.revision),
-        seed=int(message.seed),
-        rate=float(message.rate),
-        cap=int(message.cap),
-        faults=tuple(_fault(fault, robots) for fault in message.faults),
-    )
-
-
-def _fault(message: Any, robots: tuple[str, ...]) -> Fault:
-    if message.robot not in robots:
-        raise ContradictionError(f"its plan faults {message.robot!r}, who is not one of the team")
-    names, values = message.parameter_names, message.parameter_values
-    return Fault(
-        robot=robots.index(message.robot),
-        mode=str(message.mode),
-        start_step=int(message.start_step),
-        duration_steps=int(message.duration_steps),
-        parameters=tuple(zip(names, map(float, values), strict=True)),
-        trigger=Trigger(TriggerKind(message.trigger), tuple(map(float, message.trigger_values))),
-        entry=int(message.entry),
-    )
