@@ -164,8 +164,9 @@ def _why_not(run: SweepRun, place: Path) -> str | None:
     except ValidationError:
         return f"{place} is of another kind"
     same = {key: getattr(run.config, key) for key in NO_MATTER}
+    found = config.model_copy(update=same).model_dump(mode="json")
     try:
-        check_same({"config": config.model_copy(update=same).model_dump()}, run.config, place)
+        check_same({"config": found}, run.config, place)
     except RunError as error:
         return str(error).split(": ")[0]
     steps = newest_step(place)

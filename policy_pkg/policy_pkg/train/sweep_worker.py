@@ -93,15 +93,18 @@ def perform(task: Task) -> None:
         UserError: it failed, or another process holds it for longer than ``task.lock_wait_s``.
         OSError: its files cannot be written.
     """
-    # Imported here: the tests of this module's rest need no torch.
-    from policy_pkg.train.trainer import train
-
     files = RunFiles(Path(task.out), task.name)
     held = f"{files.folder} is being trained"
     with exclusive(files.lock, task.lock_wait_s, held, lambda: _say(f"waiting: {held}")):
-        if newest_step(files.folder) < task.config.total_steps:  # else another process was first
+        steps = newest_step(files.folder)
+        if steps < task.config.total_steps:
+            _say(f"process {os.getpid()} trains {task.name} from step {steps}")
+            # Imported here: a process that finds nothing to do needs no torch.
+            from policy_pkg.train.trainer import train
+
             train(task.config, files.folder, resume=True, progress=_Told(files.progress))
         drop_replay(files.folder)
+        _say("finished")
 
 
 def main() -> int:
@@ -109,13 +112,11 @@ def main() -> int:
     task = Task.model_validate_json(line)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     sys.argv = task.command  # what run.json keeps as the way to repeat the run
-    _say(f"process {os.getpid()} begins or continues {task.name}")
     try:
         perform(task)
     except (UserError, OSError) as error:
         _say(f"error: {error}")
         return 1
-    _say("finished")
     return 0
 
 

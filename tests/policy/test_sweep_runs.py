@@ -1,0 +1,146 @@
+"""Sweeps that train: killed, stopped, with a failing run, on a cluster that loses a node."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from sweep_cases import (
+    assert_same_results,
+    processes_of,
+    tiny_runs,
+    train_alone,
+    unfinish,
+    write_sweep,
+)
+
+from policy_pkg.checkpoint import CHECKPOINTS, find_checkpoint, load_policy
+from policy_pkg.train.results import read_runs
+from policy_pkg.train.sweep import Sweep
+from policy_pkg.train.sweep_config import SweepRun
+from policy_pkg.train.sweep_files import RunFiles, exclusive, newest_step
+from policy_pkg.train.sweep_local import LocalEngine
+
+COMMAND = [sys.executable, "-m", "crash_coach_bringup.cli.main", "sweep"]
+
+
+def start(sweep: Path, out: Path, *options: str) -> subprocess.Popen[str]:
+    """The command in a process group of its own, as a shell starts it."""
+    command = [*COMMAND, str(sweep), "--out", str(out), "--processes", "2", *options]
+    return subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+        env={**os.environ, "COLUMNS": "300"},
+    )
+
+
+def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+    """Until it holds, while the process runs."""
+    deadline = time.monotonic() + 100
+    while not condition():
+        assert process.poll() is None, process.communicate()[0]
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def kill(process: subprocess.Popen[str], out: Path) -> None:
+    """SIGKILL to the whole process group; what it started must not run on."""
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate(timeout=30)
+    deadline = time.monotonic() + 20
+    while processes_of(out):
+        assert time.monotonic() < deadline, f"{processes_of(out)} run on unseen"
+        time.sleep(0.02)
+
+
+def steps(runs: list[SweepRun], out: Path) -> int:
+    return sum(newest_step(out / run.name) for run in runs)
+
+
+def test_killed_twice_ends_with_the_same_results(tmp_path: Path) -> None:
+    runs, out = tiny_runs(tmp_path), tmp_path / "out"
+    train_alone(runs, tmp_path / "alone")
+    for _ in range(2):
+        before = steps(runs, out)
+        process = start(tmp_path / "sweep.yaml", out)
+        wait_for(lambda before=before: steps(runs, out) > before, process)  # type: ignore[misc]
+        kill(process, out)
+    done = start(tmp_path / "sweep.yaml", out)
+    assert "all 2 runs are finished" in done.communicate(timeout=100)[0]
+    assert done.returncode == 0
+    assert_same_results(runs, out, tmp_path / "alone")
+    before = {p: p.stat().st_mtime_ns for p in (out / "buttons").rglob("*")}
+    again = start(tmp_path / "sweep.yaml", out)
+    assert "2 finished (0 of them elsewhere), 0 to continue, 0 new" in again.communicate()[0]
+    assert {p: p.stat().st_mtime_ns for p in (out / "buttons").rglob("*")} == before
+
+
+@pytest.mark.soak
+def test_killed_ten_times_at_random_moments(tmp_path: Path) -> None:
+    chance = random.Random(7)
+    changes = {"total_steps": 12_000, "seeds": [0, 1]}
+    runs, out = tiny_runs(tmp_path, **changes), tmp_path / "out"
+    train_alone(runs, tmp_path / "alone")
+    killed = 0
+    for _ in range(10):
+        process = start(tmp_path / "sweep.yaml", out)
+        try:
+            process.communicate(timeout=chance.uniform(0.5, 12))
+        except subprocess.TimeoutExpired:
+            killed += 1
+            kill(process, out)
+    assert killed == 10, "the sweep is too short for ten kills"
+    done = start(tmp_path / "sweep.yaml", out)
+    assert "all 4 runs are finished" in done.communicate(timeout=600)[0]
+    assert_same_results(runs, out, tmp_path / "alone")
+
+
+def test_a_failing_run_is_told_and_the_other_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs, out = tiny_runs(tmp_path, total_steps=600), tmp_path / "out"
+    bad, good = runs
+    foreign = out / bad.name / "notes.txt"
+    foreign.parent.mkdir(parents=True)
+    foreign.write_text("mine")
+    sweep = Sweep(runs, out, command=["crash-coach", "sweep", "mine.yaml"])
+    with exclusive(RunFiles(out, good.name).lock, 0.0, ""):
+        late = Sweep([good], out, lock_wait_s=0.5)
+        late.work(LocalEngine(1))
+    assert "is being trained by another process (process" in late.failed[good.name]
+    sweep.work(LocalEngine(2))
+    assert list(sweep.failed) == [bad.name]
+    assert "qmix-s0 is not empty and holds no run" in sweep.failed[bad.name]
+    assert str(RunFiles(out, bad.name).log) in sweep.failed[bad.name]
+    assert sweep.standings[good.name].done
+    # What a finished run leaves is a run as any other, without the replay.
+    folder = out / good.name
+    assert not list(folder.rglob("replay.safetensors"))
+    assert len(list((folder / CHECKPOINTS).iterdir())) == 1
+    assert load_policy(folder).path == find_checkpoint(folder)
+    (found,) = read_runs([folder])
+    assert (found.method, found.finished) == ("adaptive", True)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.soak
+def test_a_stopped_sweep_says_how_to_go_on(tmp_path: Path, number: signal.Signals) -> None:
+    path = write_sweep(tmp_path / "sweep.yaml", total_steps=200_000)
+    process = start(path, tmp_path / "out")
+    wait_for(lambda: len(processes_of(tmp_path / "out")) >= 3, process)
+    os.killpg(process.pid, number)
+    output = process.communicate(timeout=30)[0]
+    assert process.returncode == 128 + number
+    assert "stopped; 2 of 2 runs are left" in output
+    assert "Traceback" not in output
+    assert not processes_of(tmp_path / "out")
