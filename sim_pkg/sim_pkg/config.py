@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -116,6 +116,18 @@ def load_tree(path: Path) -> YamlTree:
     return YamlTree(path, values, lines)
 
 
+def parse_value(text: str) -> Any:
+    """One YAML value, read as in a file: for values on a command line.
+
+    Raises:
+        ConfigError: not YAML.
+    """
+    try:
+        return yaml.load(text, Loader=_Loader)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{text!r} is not a YAML value") from error
+
+
 def validate(tree: YamlTree, model: type[ModelT]) -> ModelT:
     """The tree as a model.
 
@@ -123,7 +135,7 @@ def validate(tree: YamlTree, model: type[ModelT]) -> ModelT:
         ConfigError: for the first thing that is wrong, with the number of further ones.
     """
     try:
-        return model.model_validate(tree.values)
+        read = model.model_validate(tree.values)
     except ValidationError as error:
         # A misspelt key is also a missing one: the misspelling says more.
         problems = sorted(
@@ -132,6 +144,32 @@ def validate(tree: YamlTree, model: type[ModelT]) -> ModelT:
         text = _describe(tree, model, dict(problems[0]))
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         raise ConfigError(text + more) from error
+    misread = next(_misread(tree.values, read, ()), None)
+    if misread is not None:
+        raise ConfigError(f"{tree.where(misread[0])}: {misread[1]}")
+    return read
+
+
+_KINDS: dict[type, str] = {bool: "true or false", int: "a number", float: "a number", str: "text"}
+
+
+def _misread(given: Any, read: Any, location: _Location) -> Iterator[tuple[_Location, str]]:
+    """What pydantic took for something else, such as true for 1: where, and what is wrong.
+
+    Its strict mode is no way out: it also refuses a list for a tuple, and 1e6 for an integer.
+    """
+    if isinstance(given, dict):
+        for key, value in given.items():
+            inner = read.get(key) if isinstance(read, dict) else getattr(read, str(key), None)
+            yield from _misread(value, inner, (*location, key))
+    elif isinstance(given, list) and isinstance(read, tuple | list) and len(given) == len(read):
+        for index, pair in enumerate(zip(given, read, strict=True)):
+            yield from _misread(*pair, (*location, index))
+    else:
+        written, wanted = _KINDS.get(type(given)), _KINDS.get(type(read))
+        if None not in (written, wanted) and written != wanted:
+            name = ".".join(str(part) for part in location)
+            yield location, f"{name} = {given!r}: {wanted} is needed, not {written}"
 
 
 def load_yaml_strict(path: Path, model: type[ModelT]) -> ModelT:

@@ -27,6 +27,8 @@ def test_a_bad_start_is_one_line_and_exit_code_1(ros_env: Env) -> None:
         ("resend_after_s:=.nan", "parameter resend_after_s = nan"),
         ("mode:=fast", "parameter mode = 'fast'"),
         ("seed:=-1", "parameter seed = -1"),
+        ("seed:=true", "parameter seed = True: .* integer"),
+        ("autostart:=1", "parameter autostart = 1: .* boolean"),
         ("episodes:=many", "parameter episodes = 'many'"),
         ("scenario:=butons", r"unknown scenario 'butons' \(did you mean 'buttons'\?\)"),
     ],

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from bad_files import check_refused
+from pydantic import Field
 
 from sim_pkg.config import SCENARIOS_DIR, ConfigError, StrictModel, load_yaml_strict
 from sim_pkg.env import make_env, scenario_names
@@ -72,6 +73,9 @@ class Outer(StrictModel):
     rate: float
     items: tuple[Inner, ...] = ()
     maybe: Inner | None = None
+    on: bool = False
+    table: dict[str, float] = Field(default_factory=dict)
+    either: int | str = 0
 
 
 @pytest.mark.parametrize(
@@ -82,6 +86,16 @@ class Outer(StrictModel):
         ("- 1\n", "expected a mapping"),
         ("", "expected a mapping"),
         ("rate: 1\nitems: 3\nwrong: 2\n", r"\(and 1 more\)"),
+        ("rate: true\n", "file.yaml:1: rate = True: a number is needed, not true or false"),
+        ("rate: '1'\n", "file.yaml:1: rate = '1': a number is needed, not text"),
+        (
+            "rate: 1\nitems:\n  - depth: 2\n  - depth: yes\n",
+            ":4: items.1.depth = True: a number",
+        ),
+        ("rate: 1\nmaybe: {depth: '3'}\n", "maybe.depth = '3': a number is"),
+        ("rate: 1\ntable:\n  a: 1\n  b: '2'\n", "yaml:4: table.b = '2': a number"),
+        ("rate: 1\n'on': 1\n", "file.yaml:2: on = 1: true or false is needed, not a number"),
+        ("rate: 1\n'on': 'yes'\n", "file.yaml:2: on = 'yes': true or false is needed"),
     ],
 )
 def test_strict_loading(tmp_path: Path, text: str, message: str) -> None:
@@ -89,6 +103,16 @@ def test_strict_loading(tmp_path: Path, text: str, message: str) -> None:
     path.write_text(text)
     with pytest.raises(ConfigError, match=message):
         load_yaml_strict(path, Outer)
+
+
+def test_what_is_a_number_is_read_as_one(tmp_path: Path) -> None:
+    """Integers where a float is meant, whole floats where an integer is; text where it may be."""
+    path = tmp_path / "file.yaml"
+    path.write_text("rate: 2\nitems: [{depth: 1e3}]\ntable: {a: 3}\neither: '1'\n'on': yes\n")
+    read = load_yaml_strict(path, Outer)
+    assert (read.rate, read.items[0].depth, read.table, read.either, read.on) == (
+        2.0, 1000, {"a": 3.0}, "1", True,
+    )  # fmt: skip
 
 
 def test_numbers_without_a_point_are_numbers(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 import numpy as np
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from crash_coach_pkg.config import CoachConfig
@@ -19,6 +18,7 @@ from sim_pkg.config import (
     YamlTree,
     did_you_mean,
     load_tree,
+    parse_value,
     shipped_names,
     validate,
 )
@@ -204,9 +204,9 @@ def _parse(text: str) -> Setting:
     if not equals:
         raise ConfigError(f"--set {text}: expected key=value or section.key=value")
     try:
-        return Setting(key.strip(), yaml.safe_load(value), f"--set {text}")
-    except yaml.YAMLError as error:
-        raise ConfigError(f"--set {text}: {value!r} is not a YAML value") from error
+        return Setting(key.strip(), parse_value(value), f"--set {text}")
+    except ConfigError as error:
+        raise ConfigError(f"--set {text}: {error}") from error
 
 
 def _apply(values: dict[str, Any], setting: Setting) -> tuple[str, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 
@@ -16,6 +16,8 @@ _OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides")
 
 class SimParameters(StrictModel):
     """Read once at start-up; the node's parameters are read-only afterwards."""
+
+    model_config = ConfigDict(strict=True)  # true is no seed, and 1 no switch
 
     scenario: str = Field("buttons", description="name of a shipped scenario, or path of a YAML")
     mode: Literal["lockstep", "realtime"] = Field(
