@@ -19,6 +19,7 @@ PACKAGES = {
     "crash_coach_pkg": ROOT / "crash_coach_pkg/crash_coach_pkg",
     "crash_coach_bringup": BRINGUP,
 }
+PARAMETER_SERVICE = "sim_pkg.ros.parameter_service"
 FAULT_SCENARIO = PACKAGES["crash_coach_pkg"] / "fault_scenario.py"
 MESSAGES = {
     "rclpy", "crash_coach_interfaces", "std_msgs", "geometry_msgs", "nav_msgs", "std_srvs",
@@ -68,6 +69,8 @@ def allowed(package: str, path: Path, name: str) -> bool:
         return True
     if within(name, "sim_pkg.config") and path == FAULT_SCENARIO:
         return True  # strict YAML is written once
+    if within(name, PARAMETER_SERVICE) and "ros" in inside[:-1]:
+        return True  # and so is what every node serves
     if package == "policy_pkg" and inside[0] == "train" and top != "crash_coach_bringup":
         return not within(name, f"{top}.ros")
     # `from sim_pkg import contract` reads as "sim_pkg" and "sim_pkg.contract".
@@ -101,6 +104,9 @@ def test_import_law() -> None:
         ("policy_pkg", "train/rollout.py", "crash_coach_pkg.coach", True),
         ("policy_pkg", "train/rollout.py", "crash_coach_pkg.ros.gate_node", False),
         ("policy_pkg", "ros/policy_node.py", "crash_coach_pkg.gate", False),
+        ("policy_pkg", "ros/node_params.py", "sim_pkg.ros.parameter_service", True),
+        ("policy_pkg", "ros/node_params.py", "sim_pkg.ros.sim_params", False),
+        ("policy_pkg", "agent.py", "sim_pkg.ros.parameter_service", False),
         ("policy_pkg", "policy.py", "yaml", False),
     ],
 )

@@ -46,9 +46,9 @@ from crash_coach_pkg.parameters import (
     parameter_specs,
 )
 from crash_coach_pkg.ros.coach_link import CoachLink
-from crash_coach_pkg.ros.parameter_service import CheckedParameterService
 from crash_coach_pkg.ros.run import SPIN_S, refuse_unknown_parameters, robot_names, spin
 from sim_pkg.contract import UserError
+from sim_pkg.ros.parameter_service import CheckedParameterService
 
 
 class CoachNode(Node):

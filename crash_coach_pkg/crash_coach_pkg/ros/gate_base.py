@@ -20,9 +20,9 @@ from crash_coach_pkg.plan import CrashPlan
 from crash_coach_pkg.plan_book import Event, EventKind, PlanBook
 from crash_coach_pkg.ros.convert import message_from_event, message_from_plan, plan_from_message
 from crash_coach_pkg.ros.endpoints import WatchedPublisher
-from crash_coach_pkg.ros.parameter_service import CheckedParameterService
 from crash_coach_pkg.ros.run import EVENTS, PLAN, TICK_S, refuse_unknown_parameters, robot_names
 from sim_pkg.contract import UserError
+from sim_pkg.ros.parameter_service import CheckedParameterService
 
 ACTION_TYPE = "crash_coach_interfaces/msg/Action"
 DIAGNOSTICS_S = 1.0

@@ -42,7 +42,7 @@ class AgentNode(Node):
     """
 
     def __init__(self, name: str, one_robot: bool, context: Context | None = None) -> None:
-        super().__init__(name, context=context)
+        super().__init__(name, context=context, start_parameter_services=False)
         parameters = read_parameters(self, PolicyParameters if one_robot else TeamParameters)
         robots = (parameters.robot,) if isinstance(parameters, PolicyParameters) else ()
         self._topics = (parameters.observation_topic, parameters.command_topic)

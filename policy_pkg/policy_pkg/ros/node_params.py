@@ -9,6 +9,7 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 
 from sim_pkg.contract import UserError
+from sim_pkg.ros.parameter_service import CheckedParameterService
 
 _OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides")
 
@@ -18,9 +19,12 @@ Model = TypeVar("Model", bound=BaseModel)
 def read_model(node: Node, model: type[Model]) -> Model:
     """Declares every field of ``model`` on ``node``, read-only; returns what was set at the start.
 
+    ``node`` is made without rclpy's parameter services: it gets checked ones here.
+
     Raises:
         UserError: an unknown name, a wrong type, a value out of range.
     """
+    CheckedParameterService(node)
     known = model.model_fields
     for name in node._parameter_overrides:
         if name not in known and name.split(".")[0] not in _OF_RCLPY:

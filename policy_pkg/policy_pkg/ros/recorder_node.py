@@ -55,7 +55,7 @@ class RecorderNode(Node):
     """
 
     def __init__(self) -> None:
-        super().__init__("recorder")
+        super().__init__("recorder", start_parameter_services=False)
         self._parameters_read = parameters = read_parameters(self)
         self._connections = connections(
             tuple(parameters.robots),

@@ -64,7 +64,12 @@ class GraphLink:
         """Episodes that could not be used."""
         self._context = Context()
         self._context.init(args=[], domain_id=graph.domain)
-        self._node = Node("trainer", context=self._context, use_global_arguments=False)
+        self._node = Node(
+            "trainer",
+            context=self._context,
+            use_global_arguments=False,
+            start_parameter_services=False,
+        )
         self._inbox = Inbox(
             f"graph {graph.index}",
             graph.spec.robots,

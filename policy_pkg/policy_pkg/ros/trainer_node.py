@@ -37,7 +37,7 @@ def load_config(parameters: TrainerParameters) -> TrainConfig:
 def _parameters() -> TrainerParameters:
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
-        node = Node("trainer")
+        node = Node("trainer", start_parameter_services=False)
         try:
             return read_parameters(node)
         finally:

@@ -1,5 +1,8 @@
 """rclpy's parameter services, and what they let through: a type that does not exist ends the node,
-and a parameter without a name is made. Here both are refused."""
+and a parameter without a name is made. Here both are refused.
+
+Other packages' nodes may import this: it is written once.
+"""
 
 from __future__ import annotations
 
