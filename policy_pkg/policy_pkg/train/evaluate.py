@@ -137,12 +137,12 @@ def evaluate(
     target: PolicyBundle | RecurrentPolicy | Scripted,
     scenario: str | Path,
     condition: Condition | Planned,
-    episodes: int,
+    episodes: int | range,
     seed: int,
     n_arenas: int = 32,
     effects: bool = False,
 ) -> Evaluation:
-    """Plays episodes 0 .. ``episodes`` - 1 greedily; equal arguments give equal episodes.
+    """Plays ``episodes``, of a number the first so many, greedily; equal arguments, equal episodes.
 
     Neither ``n_arenas`` nor the policy changes which episodes and crashes are drawn, so methods
     evaluated with one seed are paired. ``effects``: keep Evaluation.effects.
@@ -152,11 +152,12 @@ def evaluate(
         ConfigError: unknown or wrong scenario, or a scripted policy that does not play it.
         UserError: ``episodes`` or the condition cannot be used with this scenario or policy.
     """
-    if episodes < 1:
+    numbers = episodes if isinstance(episodes, range) else range(episodes)
+    if not numbers:
         raise UserError(f"episodes = {episodes}: at least 1 is needed")
-    env = make_env(scenario, max(1, min(n_arenas, episodes)))
+    env = make_env(scenario, max(1, min(n_arenas, len(numbers))))
     run = _Run(env, _team(target, env), condition, seed, [] if effects else None)
-    return run.evaluation(range(episodes))
+    return run.evaluation(numbers)
 
 
 def evaluate_in(

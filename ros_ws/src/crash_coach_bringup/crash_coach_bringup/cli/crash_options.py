@@ -13,13 +13,13 @@ from policy_pkg.train.evaluate import Condition, at_rate, crash_free, exactly, n
 from sim_pkg.contract import UserError
 
 CrashedOption = Annotated[
-    list[int] | None, typer.Option(help="K ...: exactly K robots, drawn anew each episode.")
+    list[int] | None, typer.Option(help="K ...: exactly K robots crash, drawn anew each episode.")
 ]
 ModeOption = Annotated[
     str,
     typer.Option(
-        help="What happens to a crashed robot: mute, random, delay or another mode of "
-        "docs/faults.md, or an installed one."
+        help="What happens to a crashed robot: mute (or stay: it stands still), random, delay or "
+        "any other mode of docs/faults.md."
     ),
 ]
 ParamOption = Annotated[

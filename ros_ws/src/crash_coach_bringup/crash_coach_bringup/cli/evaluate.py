@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
@@ -27,10 +26,11 @@ from crash_coach_bringup.cli.output import (
 )
 from crash_coach_bringup.cli.target import HELP, Target, load_target
 from policy_pkg.train.evaluate import Condition, Evaluation, Scripted
-from policy_pkg.train.evaluate import evaluate as evaluate_in_core
+from policy_pkg.train.evaluate_processes import evaluate_on
 from sim_pkg.trajectory import combine
 
 MOST_EPISODES = 1_000_000
+MOST_PROCESSES = 1024
 
 
 class Via(StrEnum):
@@ -45,33 +45,42 @@ class Layout(StrEnum):
 
 
 ViaOption = Annotated[
-    Via, typer.Option(help="In this process, or as a real ROS graph in lock-step.")
+    Via,
+    typer.Option(help="Played here, or by a real ROS graph in lock-step, with the same results."),
 ]
 LayoutOption = Annotated[
     Layout,
-    typer.Option(help="With ROS: a process per node, one for the team, or a single process."),
+    typer.Option(help="With --via ros: a process per node, one for the team, or a single process."),
 ]
 
 
-def evaluator(
-    target: Target, via: Via, layout: Layout
-) -> Callable[[Condition, int, int], Evaluation]:
-    """(condition, episodes, seed) -> Evaluation, in this process or as a ROS graph.
+def play(
+    target: Target,
+    conditions: list[Condition],
+    episodes: int,
+    seed: int,
+    processes: int,
+    via: Via,
+    layout: Layout,
+) -> list[Evaluation]:
+    """Each condition's evaluation, in processes of this machine or as a ROS graph.
 
     Raises:
-        CliError: a scripted team over ROS.
+        CliError: a scripted team over ROS, or several graphs.
     """
     if via is Via.core:
-        return lambda condition, episodes, seed: evaluate_in_core(
-            target.team, target.scenario, condition, episodes, seed
-        )
+        return evaluate_on(processes, target.team, target.scenario, conditions, episodes, seed)
+    if processes > 1:
+        raise CliError(f"--processes {processes}: with --via ros one graph plays all episodes")
     if isinstance(target.team, Scripted):
         raise CliError(f"--via ros: {target.name} has no nodes; scripted teams play in the core")
     from crash_coach_bringup.ros.evaluation import evaluate_via_ros
 
-    return lambda condition, episodes, seed: evaluate_via_ros(
-        Path(target.name), target.scenario, condition, episodes, seed, layout.value
-    )
+    checkpoint, scenario = Path(target.name), target.scenario
+    return [
+        evaluate_via_ros(checkpoint, scenario, condition, episodes, seed, layout.value)
+        for condition in conditions
+    ]
 
 
 def show(title: str, results: list[tuple[Condition, Evaluation]]) -> None:
@@ -110,22 +119,34 @@ def evaluate(
         int, typer.Option(help="Episodes per condition.", min=1, max=MOST_EPISODES)
     ] = 128,
     crash_rate: Annotated[
-        list[float] | None, typer.Option(help="R ...: each robot crashes with probability R.")
+        list[float] | None,
+        typer.Option(help="R ...: each robot crashes with probability R, drawn each episode."),
     ] = None,
     crashed: CrashedOption = None,
     victims: Annotated[
-        list[str] | None, typer.Option(help="ROBOT ...: these robots, in every episode.")
+        list[str] | None, typer.Option(help="ROBOT ...: all of these robots, in every episode.")
     ] = None,
     mode: ModeOption = "stay",
     param: ParamOption = None,
+    processes: Annotated[
+        int,
+        typer.Option(
+            help="How many processes share the episodes; changes no result.",
+            min=1,
+            max=MOST_PROCESSES,
+        ),
+    ] = 1,
     via: ViaOption = Via.core,
     layout: LayoutOption = Layout.nodes,
     seed: Annotated[
-        int, typer.Option(help="Seed of episodes, victims, random actions.", min=0)
+        int, typer.Option(help="Of the episodes, the victims and random actions.", min=0)
     ] = 0,
     json: Annotated[Path | None, typer.Option(help="Also write the result to this file.")] = None,
 ) -> None:
-    """Evaluates a team, a trained one greedily; without a crash option, crash-free."""
+    """Tells how a team does under crashes, or crash-free without a crash option.
+
+    Trained teams act greedily. Every rate, every number and the victims together are a row each.
+    """
     check_json_target(json)
     parameters = mode_parameters(mode, param or [])
     target = load_target(team, scenario)
@@ -133,8 +154,8 @@ def evaluate(
     asked = conditions(
         target.robots, crash_rate or [], crashed or [], victims or [], mode, parameters
     )
-    run = evaluator(target, via, layout)
-    results = [(condition, run(condition, episodes, seed)) for condition in asked]
+    played = play(target, asked, episodes, seed, processes, via, layout)
+    results = list(zip(asked, played, strict=True))
     show(f"{team} on {name}: {episodes} episodes each, seed {seed}, via {via}", results)
     summaries = as_json(results)
     trajectory_hash = combine(row["trajectory_hash"] for row in summaries)

@@ -152,7 +152,10 @@ def profile(
     seed: Annotated[list[int] | None, typer.Option(help="Seed of the run.")] = None,
     json: Annotated[Path | None, typer.Option(help="Also write the result to this file.")] = None,
 ) -> None:
-    """Trains for a while, and tells where the time goes and what to change. Keeps no run."""
+    """Tells where a training run's time goes.
+
+    Trains from the start, measures for a while, says what to change. The run is not kept.
+    """
     check_json_target(json)
     if seed and len(seed) > 1:
         raise CliError(f"--seed {' '.join(map(str, seed))}: one run takes one seed")

@@ -52,7 +52,7 @@ def asked(
 
 CrashedOption = Annotated[
     list[int] | None,
-    typer.Option(help="K ...: exactly K robots, drawn anew each episode. [default: 0 1 2]"),
+    typer.Option(help="K ...: exactly K robots crash, drawn anew each episode. [default: 0 1 2]"),
 ]
 RateOption = Annotated[
     list[float] | None,
@@ -87,7 +87,10 @@ def report(
     seed: Annotated[int, typer.Option(help="Of the episodes, the same for every run.", min=0)] = 0,
     trajectories: TrajectoriesOption = None,
 ) -> None:
-    """Evaluates runs alike: methods, named after their folders, over their training seeds."""
+    """Compares methods over seeds: evaluates many runs alike.
+
+    Runs with equal settings are seeds of one method, which is called what their folders are.
+    """
     if not folders:
         raise CliError("nothing to report on: name runs or folders of runs")
     parameters = mode_parameters(mode, param or [])
