@@ -8,17 +8,20 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "bags"))
 from bag_maker import Team, messages, played, write
 
+from crash_coach_bringup.cli import calibrate
 from crash_coach_bringup.cli.main import main
 from crash_coach_bringup.ros.probe import find_executable
-from policy_pkg.train.evaluate import Scripted, evaluate, exactly, named
+from policy_pkg.train.evaluate import Scripted, evaluate, exactly, named, record
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
+from sim_pkg.frames import Frames
 
 RANDOM = ("scripted:random", "--scenario", "buttons")
 
@@ -173,6 +176,26 @@ def test_calibrate_counts_wins_and_losses(tmp_path: Path) -> None:
     for name in ("success_rate", "success_ci95", "steps_mean", "return_mean"):
         assert rows[1][name] == pytest.approx(played[name])
     assert rows[4]["robots_lost_mean"] == 0
+
+
+def test_calibrate_counts_alike_however_many_it_keeps(monkeypatch: pytest.MonkeyPatch) -> None:
+    args = ("focus", "skirmish/3m", exactly(1, "stay"), 10, 3)
+    whole = calibrate.tally(*args)
+    kept = []
+
+    def some(*args: Any) -> list[Frames]:
+        kept.append(record(*args))
+        return kept[-1]
+
+    monkeypatch.setattr(calibrate, "AT_ONCE", 4)
+    monkeypatch.setattr(calibrate, "record", some)
+    parts = calibrate.tally(*args)
+    assert [[frames.episode for frames in frames_] for frames_ in kept] == [
+        [0, 1, 2, 3], [4, 5, 6, 7], [8, 9],
+    ]  # fmt: skip
+    assert parts == whole
+    assert parts.episodes == 10
+    assert parts.opponents_lost > 0
 
 
 def test_calibrate_refuses_what_it_cannot_play() -> None:

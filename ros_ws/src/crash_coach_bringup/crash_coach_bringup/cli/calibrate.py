@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 
 from crash_coach_bringup.cli.crash_options import (
@@ -31,23 +31,50 @@ from sim_pkg.env import make_env
 from sim_pkg.frames import Frames, Side
 from sim_pkg.scripted import make_scripted, scripted_names
 
+AT_ONCE = 256  # episodes that are kept before they are counted; about 100 kB each
 
-def figures(episodes: Sequence[Frames]) -> dict[str, Any]:
-    """JSON values: win rate with its Wilson interval, mean length, who was lost on average."""
-    wins = sum(frames.success for frames in episodes)
-    interval = wilson(wins, len(episodes))
 
-    def lost(side: Side) -> float:
-        return float(np.mean([(~f.alive[-1, f.indexes(side)]).sum() for f in episodes]))
+@dataclass
+class Tally:
+    """Sums over episodes: what is left of each of them."""
 
-    return {
-        "success_rate": wins / len(episodes),
-        "success_ci95": [interval.low, interval.high],
-        "steps_mean": float(np.mean([frames.steps for frames in episodes])),
-        "robots_lost_mean": lost(Side.ROBOTS),
-        "opponents_lost_mean": lost(Side.OPPONENTS),
-        "return_mean": float(np.mean([frames.returns[-1] for frames in episodes])),
-    }
+    episodes: int = 0
+    wins: int = 0
+    steps: int = 0
+    robots_lost: int = 0
+    opponents_lost: int = 0
+    episode_return: float = 0.0
+
+    def count(self, frames: Frames) -> None:
+        dead = ~frames.alive[-1]
+        self.episodes += 1
+        self.wins += frames.success
+        self.steps += frames.steps
+        self.robots_lost += int(dead[frames.indexes(Side.ROBOTS)].sum())
+        self.opponents_lost += int(dead[frames.indexes(Side.OPPONENTS)].sum())
+        self.episode_return += float(frames.returns[-1])
+
+    def figures(self) -> dict[str, Any]:
+        """JSON values: win rate with its Wilson interval, mean length, who was lost on average."""
+        interval = wilson(self.wins, self.episodes)
+        return {
+            "success_rate": self.wins / self.episodes,
+            "success_ci95": [interval.low, interval.high],
+            "steps_mean": self.steps / self.episodes,
+            "robots_lost_mean": self.robots_lost / self.episodes,
+            "opponents_lost_mean": self.opponents_lost / self.episodes,
+            "return_mean": self.episode_return / self.episodes,
+        }
+
+
+def tally(policy: str, scenario: str, condition: Condition, episodes: int, seed: int) -> Tally:
+    """Plays episodes 0 .. ``episodes`` - 1, at most AT_ONCE of them in memory."""
+    out = Tally()
+    for first in range(0, episodes, AT_ONCE):
+        some = range(first, min(first + AT_ONCE, episodes))
+        for frames in record(Scripted(policy), scenario, condition, some, seed):
+            out.count(frames)
+    return out
 
 
 def asked_of(
@@ -80,7 +107,7 @@ def rows_of(
             "scenario": scenario,
             "policy": name,
             "condition": condition.name,
-            **figures(record(Scripted(name), scenario, condition, range(episodes), seed)),
+            **tally(name, scenario, condition, episodes, seed).figures(),
         }
         for name, condition in asked
     ]
