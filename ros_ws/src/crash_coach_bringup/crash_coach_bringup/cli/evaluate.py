@@ -52,6 +52,14 @@ LayoutOption = Annotated[
     Layout,
     typer.Option(help="With --via ros: a process per node, one for the team, or a single process."),
 ]
+ProcessesOption = Annotated[
+    int,
+    typer.Option(
+        help="How many processes share the episodes; changes no result.",
+        min=1,
+        max=MOST_PROCESSES,
+    ),
+]
 
 
 def play(
@@ -128,14 +136,7 @@ def evaluate(
     ] = None,
     mode: ModeOption = "stay",
     param: ParamOption = None,
-    processes: Annotated[
-        int,
-        typer.Option(
-            help="How many processes share the episodes; changes no result.",
-            min=1,
-            max=MOST_PROCESSES,
-        ),
-    ] = 1,
+    processes: ProcessesOption = 1,
     via: ViaOption = Via.core,
     layout: LayoutOption = Layout.nodes,
     seed: Annotated[
