@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -81,8 +80,3 @@ def processes_of(out: Path) -> list[int]:
         if any(link.startswith(f"{out}/") for link in links):
             found.append(int(process.name))
     return sorted(set(found) - {os.getpid()})
-
-
-def unfinish(folder: Path) -> None:
-    """As if the run had been killed at its last checkpoint but one."""
-    shutil.rmtree(find_checkpoint(folder))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
 import threading
 import time
 from pathlib import Path
@@ -17,7 +19,9 @@ from policy_pkg.train.sweep_config import SweepRun
 from policy_pkg.train.sweep_files import (
     RunFiles,
     RunProgress,
+    check_mark,
     exclusive,
+    leave_mark,
     read_progress,
     standing,
     write_progress,
@@ -105,6 +109,23 @@ def test_a_lock_is_waited_for_so_long_and_no_longer(tmp_path: Path) -> None:
     with exclusive(path, 30.0, "it is held", lambda: waited.append(True)):
         assert waited == [True]
     holder.join()
+
+
+def test_a_machine_that_sees_another_folder_is_told(tmp_path: Path) -> None:
+    mark = leave_mark(tmp_path)
+    check_mark(str(tmp_path), mark)
+    with pytest.raises(RunError, match=r"it does not see .*mark: No such file"):
+        check_mark(str(tmp_path / "elsewhere"), mark)
+    leave_mark(tmp_path)
+    with pytest.raises(RunError, match=r"its .*mark is another file"):
+        check_mark(str(tmp_path), mark)
+
+
+def test_without_ray_it_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    monkeypatch.delitem(sys.modules, "policy_pkg.train.sweep_ray", raising=False)
+    with pytest.raises(RunError, match=r"--engine ray needs the extra package ray: .*make ray"):
+        importlib.import_module("policy_pkg.train.sweep_ray")
 
 
 def test_progress_is_read_as_it_was_written(tmp_path: Path) -> None:

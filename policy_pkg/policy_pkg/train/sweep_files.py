@@ -16,6 +16,7 @@ import json
 import os
 import socket
 import time
+import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -173,6 +174,29 @@ def _why_not(run: SweepRun, place: Path) -> str | None:
     if steps < run.config.total_steps:
         return f"{place} is not finished: {steps:,} of {run.config.total_steps:,} steps"
     return None
+
+
+def leave_mark(out: Path) -> str:
+    """Writes something into the sweep's folder that no other has; returns it.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    mark = uuid.uuid4().hex
+    (out / HIDDEN).mkdir(parents=True, exist_ok=True)
+    (out / HIDDEN / "mark").write_text(mark, encoding="utf-8")
+    return mark
+
+
+def check_mark(out: str, mark: str) -> None:
+    """Raises RunError where this machine's ``out`` is not that in which ``mark`` was left."""
+    path = Path(out) / HIDDEN / "mark"
+    try:
+        found = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise RunError(f"it does not see {path}: {error.strerror}") from error
+    if found != mark:
+        raise RunError(f"its {path} is another file")
 
 
 @contextmanager

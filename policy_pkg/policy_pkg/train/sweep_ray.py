@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import uuid
 from pathlib import Path
 from typing import Any
 
 from policy_pkg.train.run_dir import RunError
 from policy_pkg.train.sweep import Ended
-from policy_pkg.train.sweep_files import HIDDEN
+from policy_pkg.train.sweep_files import check_mark, leave_mark
 from policy_pkg.train.sweep_task import Child, Task
 
 # Read when Ray is imported: nothing is sent to its makers.
@@ -26,17 +25,6 @@ except ModuleNotFoundError as error:
 
 MOST_RETRIES = 10  # of a task whose node was lost
 CHECK_S = 120.0
-
-
-def check_mark(out: str, mark: str) -> None:
-    """Raises RunError where this machine does not see the sweep's folder."""
-    path = Path(out) / HIDDEN / "mark"
-    try:
-        found = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise RunError(f"it does not see {path}: {error.strerror}") from error
-    if found != mark:
-        raise RunError(f"its {path} is another file")
 
 
 def perform(task: str, mark: str) -> str | None:
@@ -68,10 +56,7 @@ class RayEngine:
     def __init__(self, out: Path, slots: int, address: str | None = None) -> None:
         self.slots = slots
         self._tasks: dict[Any, str] = {}
-        self._mark = uuid.uuid4().hex
-        path = out / HIDDEN / "mark"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(self._mark, encoding="utf-8")
+        self._mark = leave_mark(out)
         try:
             ray.init(address=address, log_to_driver=False, logging_level="error")
         except (ConnectionError, ValueError, RuntimeError) as error:
