@@ -7,7 +7,7 @@ IN_ENV := . ./env.sh &&
 CHECKED := tests/test_architecture.py tests/test_documents.py
 CODE := sim_pkg policy_pkg crash_coach_pkg ros_ws/src/crash_coach_bringup tests benchmarks scripts
 
-.PHONY: help setup check test demo bench soak format lock clean
+.PHONY: help setup check test demo bench soak ray format lock clean
 
 help: ## this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -30,15 +30,20 @@ demo: setup ## train two teams, run them as ROS graphs, crash robots, read off t
 bench: setup ## every benchmark, to runs/bench.json
 	$(IN_ENV) python -m benchmarks
 
-soak: setup ## fuzz, kill and latency tests at full size
+soak: setup ray ## fuzz, kill and latency tests at full size
 	$(IN_ENV) pytest -m soak --timeout 3600
+
+ray: setup ## the extra that `crash-coach sweep --engine ray` needs
+	@.venv/bin/uv pip install --quiet --python .venv/bin/python -r requirements-ray.lock
 
 format: setup ## put the code in its format
 	$(IN_ENV) ruff format $(CODE) && ruff check --fix $(CODE)
 
-lock: setup ## requirements.in -> requirements.lock
+lock: setup ## requirements.in -> requirements.lock, and the extra's
 	.venv/bin/uv pip compile --quiet --universal --no-header --python-version 3.11 \
 	    requirements.in -o requirements.lock
+	.venv/bin/uv pip compile --quiet --universal --no-header --python-version 3.11 \
+	    -c requirements.lock requirements-ray.in -o requirements-ray.lock
 
 clean: ## remove what set-up and builds left (runs/ stays)
 	rm -rf .venv ros_ws/build ros_ws/install ros_ws/log

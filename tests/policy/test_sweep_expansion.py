@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -113,3 +114,13 @@ def test_table1_is_the_papers() -> None:
         "adaptive-s0": ("adaptive", 0, True),
     }
     assert {c.crash_mode for c in coaches.values()} == {"random"}
+
+
+def test_the_example_in_the_documents_is_a_sweep(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "sweeps.md").read_text()
+    (example,) = re.findall(r"```yaml\n(.*?)```", page, flags=re.DOTALL)
+    (tmp_path / "mine.yaml").write_text(example)
+    runs = load_sweep(tmp_path / "mine.yaml")
+    assert len(runs) == 4 * 2 * 3
+    assert runs[3].name == "3m/strategy_adaptive-beta_0.7-s0"
+    assert len(load_sweep(tmp_path / "mine.yaml", "quick")) == 2 * 2
