@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ from policy_pkg.train.sweep_files import (
 from policy_pkg.train.sweep_task import Task
 
 POLL_S = 0.2
+LOOK_S = 1.0  # between two looks at every run's progress
 LOCK_WAIT_S = 120.0
 
 
@@ -95,7 +97,7 @@ class Sweep:
     runs: Sequence[SweepRun]
     out: Path
     have: Sequence[Path] = ()
-    command: Sequence[str] = ()
+    command: Sequence[str] = field(default_factory=lambda: list(sys.argv))
     lock_wait_s: float = LOCK_WAIT_S
     standings: dict[str, Standing] = field(init=False)
     failed: dict[str, str] = field(default_factory=dict, init=False)
@@ -126,9 +128,12 @@ class Sweep:
         """
         with exclusive(self.out / HIDDEN / "lock", 0.0, f"{self.out} is being worked on"):
             try:
+                look_s = -LOOK_S
                 while self.left and not stopped():
                     self._fill(engine, tell)
-                    watch(self._look(tell))
+                    if time.monotonic() - look_s >= LOOK_S:
+                        look_s = time.monotonic()
+                        watch(self._look(tell))
                     self._take(engine.poll(), tell)
                     time.sleep(POLL_S)
             finally:

@@ -78,7 +78,7 @@ class Child:
             log.seek(self._log_from)
             lines = log.read().decode(errors="replace").splitlines()
         tail = "\n".join(f"    {line}" for line in lines[-TAIL_LINES:])
-        return f"{what}; the end of {self._files.log}:\n{tail}"
+        return f"{what}; see {self._files.log}, which ends with:\n{tail}"
 
     def terminate(self) -> None:
         """Asks it to end; what it did since its last checkpoint is lost."""

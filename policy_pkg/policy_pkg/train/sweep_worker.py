@@ -13,7 +13,7 @@ import threading
 import time
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from policy_pkg.checkpoint import CHECKPOINTS, list_checkpoints
 from policy_pkg.train.sweep_files import (
@@ -108,7 +108,9 @@ def perform(task: Task) -> None:
 
 
 def main() -> int:
-    line: Any = sys.stdin.buffer.readline()
+    line = sys.stdin.buffer.readline()
+    if not line:  # the parent died before it could say anything
+        return 1
     task = Task.model_validate_json(line)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     sys.argv = task.command  # what run.json keeps as the way to repeat the run

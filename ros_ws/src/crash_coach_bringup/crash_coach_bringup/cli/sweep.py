@@ -128,7 +128,7 @@ def _say_what_is_done(work: Sweep) -> None:
 
 def _conclude(work: Sweep, stopped: int, command: list[str]) -> None:
     for name, why in work.failed.items():
-        _print(f"{name} failed: {why}")
+        _print(f"{name} failed: {why.splitlines()[0]}")
     left = sum(not each.done for each in work.standings.values())
     if not left:
         _print(f"all {len(work.runs)} runs are finished, in {work.out}")
