@@ -12,6 +12,13 @@ from policy_pkg.train.sweep import Snapshot, Sweep
 from policy_pkg.train.sweep_files import RunFiles
 
 
+@pytest.fixture(autouse=True)
+def _as_nice_as_this(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray gives its workers 15 more, with which little is left beside other work."""
+    monkeypatch.setenv("RAY_worker_niceness", "0")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+
+
 @pytest.mark.soak
 @pytest.mark.timeout(900)
 def test_a_lost_node_loses_no_run_and_repeats_none(tmp_path: Path) -> None:

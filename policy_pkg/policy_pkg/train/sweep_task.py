@@ -55,7 +55,7 @@ class Child:
                 stderr=log,
                 env={**os.environ, **dict.fromkeys(THREADS, "1")},
                 cwd=task.cwd,
-                start_new_session=True,  # Ctrl-C is for the sweep alone
+                process_group=0,  # Ctrl-C is for the sweep alone
             )
         if self._process.stdin is not None:
             with suppress(BrokenPipeError):  # it died at once: poll tells
