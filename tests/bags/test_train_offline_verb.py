@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from bag_maker import Made, Team, messages, played, write
 
 from crash_coach_bringup.cli.main import main
 from crash_coach_bringup.ros.probe import find_executable
+from policy_pkg.bags.about import same_scenario
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.train.bag_dataset import load_episodes
 from policy_pkg.train.offline_data import load_data
@@ -88,22 +90,71 @@ def test_recordings_become_a_policy(typed: Typed, tmp_path: Path, bags: list[Pat
     assert (run / "metrics.jsonl").read_bytes() == before
 
 
+def test_several_seeds_are_runs_of_their_own(
+    typed: Typed, tmp_path: Path, bags: list[Path]
+) -> None:
+    one, several = tmp_path / "one", tmp_path / "several"
+    numbers = "episode_numbers=[0, 4]"
+    rest = (*QUICK, numbers, "--seed")
+    assert typed("offline/qmix", *bags, "--out", one, *rest, "2") == (0, "")
+    for resumed in (False, True):
+        again = ("--resume",) if resumed else ()
+        command = ("offline/qmix", *bags, "--out", several, *again, *rest, "1", "2")
+        assert typed(*command) == (0, "")
+        assert sorted(run.name for run in several.iterdir()) == ["qmix-s1", "qmix-s2"]
+        metrics = [(run / "metrics.jsonl").read_bytes() for run in (several / "qmix-s2", one)]
+        assert metrics[0] == metrics[1]
+    assert json.loads((one / "run.json").read_text())["data"]["episodes"] == 5
+
+
+def test_recordings_of_another_scenario_are_refused(
+    refused: Refused, tmp_path: Path, team: Team, made: list[Made]
+) -> None:
+    here = write(tmp_path / "here", team, messages(made))
+    there = replace(team.about, scenario="coverage")
+    other = write(tmp_path / "other", team, messages(made), about=there)
+    line = refused("offline/qmix", here, other, "--out", tmp_path / "x", *QUICK)
+    assert f"{other}: recorded on scenario 'coverage', {here} on 'buttons'" in line
+    line = refused("offline/qmix", other, "--out", tmp_path / "x", *QUICK)
+    assert "was recorded on scenario 'coverage', not on 'buttons' as the configuration" in line
+    assert [one.scenario for one in load_episodes([other], strict=True)] == ["coverage"] * len(made)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("buttons", "buttons", True),
+        ("buttons", "", True),
+        ("skirmish/3m", "skirmish/2s3z", False),
+        ("skirmish/3m", "other/3m", False),
+        ("mine/four.yaml", "/there/four.yaml", True),
+        ("mine/four.yaml", "/there/five.yaml", False),
+        ("buttons", "copy/buttons.yaml", True),
+    ],
+)
+def test_scenarios_are_told_apart(one: str, other: str, same: bool) -> None:
+    assert same_scenario(one, other) is same_scenario(other, one) is same
+
+
 def test_wrong_arguments_are_one_line(refused: Refused, tmp_path: Path, bags: list[Path]) -> None:
     out = ("--out", tmp_path / "run")
     assert "nowhere" in refused("offline/qmix", tmp_path / "nowhere", *out)
     line = refused("buttons/qmix", bags[0], *out)
     assert "no training config 'buttons/qmix'" in line
-    line = refused("offline/qmix", bags[0], *out, "--seed", "1", "2")
-    assert "--seed 1 2: one run takes one seed" in line
+    line = refused("offline/qmix", bags[0], *out, "--seed", "1", "1")
+    assert "--seed 1 1: a seed comes twice" in line
+    line = refused("offline/qmix", bags[0], *out, "--set", "episode_numbers=[7, 9]")
+    assert "no complete episode numbered 7 to 9: there is nothing to learn from" in line
     line = refused("offline/qmix", bags[0], *out, "--set", "batch_episodes=50")
     assert line == ("crash-coach: error: batch_episodes 50 is more than the 3 recorded episodes\n")
     assert not (tmp_path / "run").exists()
 
 
 def test_recordings_of_another_team_are_refused(
-    refused: Refused, tmp_path: Path, bags: list[Path]
+    refused: Refused, tmp_path: Path, team: Team, made: list[Made]
 ) -> None:
-    line = refused("offline/qmix", bags[0], "--out", tmp_path / "x", *QUICK, "scenario=transport_4")
+    untold = write(tmp_path / "bag", team, messages(made), about=replace(team.about, scenario=""))
+    line = refused("offline/qmix", untold, "--out", tmp_path / "x", *QUICK, "scenario=transport_4")
     assert "has 2 robots (robot_1, robot_2), scenario 'transport_4' has 4" in line
 
 

@@ -32,6 +32,7 @@ class Recording:
     success: bool
     seed: int
     number: int
+    scenario: str = ""
 
 
 def recording(episode: Episode, number: int, seed: int = 0) -> Recording:

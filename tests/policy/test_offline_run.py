@@ -19,9 +19,10 @@ from offline_recordings import (
 
 from policy_pkg.checkpoint import CheckpointError, find_checkpoint, load_policy, read_manifest
 from policy_pkg.checkpoint import read_tensors as tensors_of
+from policy_pkg.train import offline
 from policy_pkg.train.evaluate import crash_free, evaluate
 from policy_pkg.train.learner import Learner
-from policy_pkg.train.offline import OfflineReport, train_offline
+from policy_pkg.train.offline import OfflineReport, OfflineSummary, read_data
 from policy_pkg.train.offline_config import OfflineConfig
 from policy_pkg.train.offline_data import load_data
 from policy_pkg.train.offline_session import MEANS, OfflineSession
@@ -65,6 +66,12 @@ METHODS = {
 @pytest.fixture(scope="module")
 def recordings() -> list[Recording]:
     return buttons_recordings(40)
+
+
+def train_offline(
+    config: OfflineConfig, recordings: list[Recording], run: Path, **rest: Any
+) -> OfflineSummary:
+    return offline.train_offline(config, read_data(config, recordings), run, **rest)
 
 
 def lines(run: Path) -> list[dict[str, Any]]:

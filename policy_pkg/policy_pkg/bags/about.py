@@ -6,6 +6,7 @@ import json
 import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 from sim_pkg.contract import UserError
@@ -13,6 +14,7 @@ from sim_pkg.contract import UserError
 RECORD = "crash_coach"
 """Name of the MCAP metadata record."""
 _CHECK = "crc32"
+_FILE = ".yaml"
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,16 @@ class About:
         """As an MCAP metadata record: JSON values, and a checksum, as MCAP has none for it."""
         values = {key: json.dumps(value) for key, value in asdict(self).items()}
         return {**values, _CHECK: _checksum(values)}
+
+
+def same_scenario(one: str, other: str) -> bool:
+    """Whether two recordings can be of one scenario: names are equal, or a file's name is, as
+    that may lie elsewhere. '' is not known, and can be any."""
+    if not one or not other or one == other:
+        return True
+    files = [Path(name).suffix == _FILE for name in (one, other)]
+    stems = [Path(name).name.removesuffix(_FILE) for name in (one, other)]
+    return any(files) and stems[0] == stems[1]
 
 
 def about_from_record(values: Mapping[str, str]) -> About:

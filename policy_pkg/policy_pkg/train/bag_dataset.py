@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from crash_coach_pkg.faults import mode_code
-from policy_pkg.bags.about import About
+from policy_pkg.bags.about import About, same_scenario
 from policy_pkg.bags.assemble import (
     ContradictionError,
     IncompleteError,
@@ -48,6 +48,7 @@ class RecordedEpisode:
     success: bool
     modes: dict[tuple[int, int], str]  # names of faults by (step, robot)
     trajectory_hash: str
+    scenario: str = ""  # name or file, as the recorder was told; "": not told
 
 
 @dataclass
@@ -98,9 +99,11 @@ def load_episodes(
             that it concerns are left out.
 
     Raises:
-        BagError: no recording in a path; bags of different teams; with ``strict``, any problem.
+        BagError: no recording in a path; bags of different teams or scenarios; with ``strict``,
+            any problem.
     """
     team: tuple[str, ...] = ()
+    scenario, told_by = "", ""
     for bag in find_bags(paths):
         reading = BagReading(bag, refuse if strict else report, memory_bytes)
         if team and reading.summary.robots and reading.summary.robots != team:
@@ -109,6 +112,13 @@ def load_episodes(
                 f"those of the bags before are {', '.join(team)}"
             )
         team = team or reading.summary.robots
+        if not same_scenario(reading.scenario, scenario):
+            raise BagError(
+                f"{bag.name}: recorded on scenario {reading.scenario!r}, {told_by} on "
+                f"{scenario!r}: a data set is of one scenario"
+            )
+        if not scenario:
+            scenario, told_by = reading.scenario, bag.name
         yield from reading.episodes()
 
 
@@ -121,11 +131,17 @@ class BagReading:
         self._report = report
         self.summary = BagSummary(bag.name, len(bag.files), scan.robots, scan.about)
 
+    @property
+    def scenario(self) -> str:
+        """As the recorder was told; "" where it was not."""
+        return self._scan.about.scenario if self._scan.about is not None else ""
+
     def episodes(self) -> Iterator[RecordedEpisode]:
         joiner, summary = self._joiner, self.summary
         for pieces, last in joiner.pieces():
             recorded = self._finished(pieces, last)
             if recorded is not None:
+                recorded = replace(recorded, scenario=self.scenario)
                 summary.count(recorded)
                 yield recorded
         summary.about = joiner.about

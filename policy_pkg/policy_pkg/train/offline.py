@@ -15,7 +15,7 @@ from policy_pkg.checkpoint import CHECKPOINTS, list_checkpoints
 from policy_pkg.train.learner import DivergedError
 from policy_pkg.train.metrics import Value
 from policy_pkg.train.offline_config import OfflineConfig
-from policy_pkg.train.offline_data import Recorded, load_data
+from policy_pkg.train.offline_data import FixedData, Recorded, load_data
 from policy_pkg.train.offline_session import OfflineSession
 from policy_pkg.train.offline_snapshot import restore, save
 from policy_pkg.train.run_dir import locked, prepare_run
@@ -66,9 +66,21 @@ class OfflineSummary:
 Progress = Callable[[OfflineReport], None]
 
 
+def read_data(
+    config: OfflineConfig, recorded: Iterable[Recorded], environment: MakeEnv = make_env
+) -> FixedData:
+    """The data set of ``config``: for several runs on the same recordings, read once.
+
+    Raises:
+        DataError: recordings, config and scenario do not fit together.
+    """
+    spec = None if config.scenario is None else environment(config.scenario, 1).spec
+    return load_data(recorded, spec, config.memory_limit_mib, config.episode_numbers)
+
+
 def train_offline(
     config: OfflineConfig,
-    recorded: Iterable[Recorded],
+    data: FixedData,
     out_dir: Path,
     resume: bool = False,
     progress: Progress = lambda report: None,
@@ -76,10 +88,10 @@ def train_offline(
     environment: MakeEnv = make_env,
     sources: Sequence[str] = (),
 ) -> OfflineSummary:
-    """Takes ``config.gradient_steps`` on the recorded episodes.
+    """Takes ``config.gradient_steps`` on recorded episodes.
 
     Args:
-        recorded: the data set, in any order; read once, at the start.
+        data: the data set, which ``read_data`` gave for this config, but for the seed.
         out_dir: becomes the run's directory; missing or empty, unless ``resume`` is set.
         resume: where ``out_dir`` holds a run on the same recordings already, continue it from
             its newest checkpoint, bit for bit as if it had never stopped.
@@ -88,13 +100,12 @@ def train_offline(
         sources: where the recordings come from, for ``run.json``.
 
     Raises:
-        UserError: recordings, config and scenario do not fit together, ``out_dir`` cannot be
-            used, a checkpoint is damaged, training diverged, or the result could not be written.
+        UserError: data, config and scenario do not fit together, ``out_dir`` cannot be used,
+            a checkpoint is damaged, training diverged, or the result could not be written.
     """
     torch.set_num_threads(1)
     arenas = min(TEST_ARENAS, config.test_episodes)
     env = None if config.scenario is None else environment(config.scenario, arenas)
-    data = load_data(recorded, env.spec if env else None, config.memory_limit_mib)
     session = OfflineSession(config, data, env)
     prepare_run(out_dir, config, resume, describe_data(session, sources))
     with locked(out_dir):

@@ -25,6 +25,9 @@ class OfflineConfig(StrictModel):
         "q_learning", description="q_learning: learner.algorithm; behaviour_cloning: imitates"
     )
     seed: int = Field(0, ge=0, lt=2**63, description="keys everything that is drawn")
+    episode_numbers: tuple[int, int] | None = Field(
+        None, description="first and last number of the recorded episodes to learn from; null: all"
+    )
     gradient_steps: int = Field(20_000, ge=1, description="gradient steps of the run")
     batch_episodes: int = Field(32, ge=1, description="episodes of one gradient step")
     memory_limit_mib: int = Field(
@@ -61,6 +64,15 @@ class OfflineConfig(StrictModel):
             )
         if self.crash_weighting != "none" and self.crash_rate is None:
             raise ValueError(f"crash_weighting {self.crash_weighting} needs a crash_rate")
+        return self
+
+    @model_validator(mode="after")
+    def _numbers_are_a_range(self) -> Self:
+        numbers = self.episode_numbers
+        if numbers is not None and not 0 <= numbers[0] <= numbers[1]:
+            raise ValueError(
+                f"episode_numbers {list(numbers)}: must be a first and a last number from 0 on"
+            )
         return self
 
     @model_validator(mode="after")

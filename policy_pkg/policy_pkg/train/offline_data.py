@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from policy_pkg.bags.about import same_scenario
 from policy_pkg.train.episode import Episode, Sizes
 from policy_pkg.train.replay import Replay
 from sim_pkg.contract import EnvSpec, UserError
@@ -38,6 +39,8 @@ class Recorded(Protocol):
     def seed(self) -> int: ...
     @property
     def number(self) -> int: ...
+    @property
+    def scenario(self) -> str: ...  # name or file; "": not known
 
 
 class DataError(UserError):
@@ -73,9 +76,12 @@ class _Entry:
 
 
 def load_data(
-    recorded: Iterable[Recorded], spec: EnvSpec | None, memory_limit_mib: int
+    recorded: Iterable[Recorded],
+    spec: EnvSpec | None,
+    memory_limit_mib: int,
+    numbers: tuple[int, int] | None = None,
 ) -> FixedData:
-    """Reads every episode.
+    """Reads every episode, or those whose number is in ``numbers``, first and last.
 
     Args:
         recorded: in any order; consumed one at a time.
@@ -93,16 +99,26 @@ def load_data(
     entries: list[_Entry] = []
     longest = 0
     for one in recorded:
+        if numbers is not None and not numbers[0] <= one.number <= numbers[1]:
+            continue
         if sizes is None:
             sizes, robots = _sizes_of(one.episode), one.robots
         longest = max(longest, one.episode.length)
         if spec is None:
             sizes = replace(sizes, episode_limit=longest)
+        if spec is not None and not same_scenario(one.scenario, spec.scenario):
+            raise DataError(
+                f"{_where(one)} was recorded on scenario {one.scenario!r}, not on "
+                f"{spec.scenario!r} as the configuration says"
+            )
         _check(one, robots, sizes, name)
         entries.append(_entry(one))
         _check_bound(sizes, len(entries), memory_limit_mib)
     if sizes is None or not entries:
-        raise DataError("the recordings hold no complete episode: there is nothing to learn from")
+        which = "" if numbers is None else f" numbered {numbers[0]} to {numbers[1]}"
+        raise DataError(
+            f"the recordings hold no complete episode{which}: there is nothing to learn from"
+        )
     entries.sort(key=lambda entry: entry.key)
     return _fixed(robots, deque(entries), sizes)
 
@@ -121,9 +137,13 @@ def _sizes_of(episode: Episode) -> Sizes:
     )
 
 
+def _where(one: Recorded) -> str:
+    return f"episode {one.number} of seed {one.seed}"
+
+
 def _check(one: Recorded, robots: tuple[str, ...], sizes: Sizes, name: str) -> None:
     """Raises DataError naming the episode, what is wrong with it and what it had to fit."""
-    episode, where = one.episode, f"episode {one.number} of seed {one.seed}"
+    episode, where = one.episode, _where(one)
     if one.robots != robots:
         raise DataError(
             f"{where} has {len(one.robots)} robots ({', '.join(one.robots)}), "

@@ -11,7 +11,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from crash_coach_bringup.cli.output import CliError, console
 from policy_pkg.bags.problems import Problem
 from policy_pkg.train.bag_dataset import load_episodes
-from policy_pkg.train.offline_config import load_offline_config
+from policy_pkg.train.offline_config import OfflineConfig, load_offline_config
 
 if TYPE_CHECKING:
     from policy_pkg.train.offline import OfflineReport
@@ -37,6 +37,21 @@ class _Bar:
         self._bars.update(self._task, completed=done, figures=figures)
 
 
+def plan_runs(
+    config: str, out: Path, overrides: list[str], seeds: list[int]
+) -> dict[Path, OfflineConfig]:
+    """Run directory -> its settings; ``out`` itself for one seed, folders below it for more."""
+    if len(seeds) < 2:
+        settings = load_offline_config(config, overrides, seeds[0] if seeds else None)
+        return {out: settings}
+    if len(set(seeds)) < len(seeds):
+        raise CliError(f"--seed {' '.join(map(str, seeds))}: a seed comes twice")
+    return {
+        out / f"{Path(config).stem}-s{seed}": load_offline_config(config, overrides, seed)
+        for seed in seeds
+    }
+
+
 def train_offline(
     config: Annotated[
         str,
@@ -48,39 +63,45 @@ def train_offline(
         list[Path],
         typer.Argument(metavar="BAG...", help="Recordings, or folders of recordings."),
     ],
-    out: Annotated[Path, typer.Option(help="Run directory.")],
+    out: Annotated[Path, typer.Option(help="Run directory; with several seeds, their parent.")],
     override: Annotated[
         list[str] | None,
         typer.Option("--set", help="key=value ...: replaces settings, e.g. learner.lr=1e-3"),
     ] = None,
-    seed: Annotated[list[int] | None, typer.Option(help="Seed.")] = None,
+    seed: Annotated[
+        list[int] | None,
+        typer.Option(help="Seed; several give several runs, one after another."),
+    ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Continue from the newest checkpoint.")
+        bool,
+        typer.Option(
+            "--resume", help="Continue from the newest checkpoint; what is finished stays."
+        ),
     ] = False,
     strict: Annotated[
         bool, typer.Option("--strict", help="Refuse recordings with any problem.")
     ] = False,
 ) -> None:
-    """Trains a team on recorded episodes, without a simulator."""
-    if seed and len(seed) > 1:
-        raise CliError(f"--seed {' '.join(map(str, seed))}: one run takes one seed")
-    settings = load_offline_config(config, override or [], seed[0] if seed else None)
+    """Trains a team on recorded episodes, without a simulator. Recordings are read once."""
+    runs = plan_runs(config, out, override or [], seed or [])
     # Imported here: the other verbs do without torch.
     from policy_pkg.train import offline
 
     columns = (TextColumn("{task.description}"), BarColumn(bar_width=24))
     with Progress(*columns, TextColumn("{task.fields[figures]}"), console=console) as bars:
-        bar = _Bar(bars, bars.add_task(out.name, total=1.0, figures="reading"))
-        summary = offline.train_offline(
-            settings,
-            load_episodes(bags, strict, _tell),
-            out,
-            resume=resume,
-            progress=bar.show,
-            sources=[str(path) for path in bags],
-        )
-    console.print(
-        f"{summary.gradient_steps:,} gradient steps on {summary.episodes:,} episodes "
-        f"in {summary.wall_s:.0f} s"
-    )
-    console.print(f"  checkpoint: {out}", soft_wrap=True)
+        tasks = {run: bars.add_task(run.name, total=1.0, figures="waiting") for run in runs}
+        data = offline.read_data(next(iter(runs.values())), load_episodes(bags, strict, _tell))
+        for run, settings in runs.items():
+            summary = offline.train_offline(
+                settings,
+                data,
+                run,
+                resume=resume,
+                progress=_Bar(bars, tasks[run]).show,
+                sources=[str(path) for path in bags],
+            )
+            console.print(
+                f"{summary.gradient_steps:,} gradient steps on {summary.episodes:,} episodes "
+                f"in {summary.wall_s:.0f} s"
+            )
+            console.print(f"  checkpoint: {run}", soft_wrap=True)
