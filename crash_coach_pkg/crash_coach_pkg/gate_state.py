@@ -25,6 +25,7 @@ from crash_coach_pkg.schedule import World
 from crash_coach_pkg.team_faults import TeamFaults
 from sim_pkg.contract import BoolArray
 
+_UNKNOWN = 2**32  # beyond every episode
 _FROM_OBSERVATION: frozenset[Need] = frozenset(("availability", "sampler"))
 
 
@@ -66,6 +67,9 @@ class GateState:
         """Commands dropped because a newer one of the same robot or a newer episode came first."""
         self.untold = [0] * n_robots
         """Robot-steps under a fault that needs the worst action, which the policy did not tell."""
+        self.ahead = [0] * n_robots
+        """Commands ignored because the sim can have asked nobody for them yet."""
+        self._last_episode = _UNKNOWN  # that a command may be for
 
     def last(self, robot: int) -> Decision | None:
         """The newest decision on ``robot``."""
@@ -110,8 +114,16 @@ class GateState:
         self._worlds.put(episode, step, world)
         return self._release(now_s)
 
+    def boundary(self, episode: int) -> None:
+        """The sim has begun or ended ``episode``: no command is for one after the next. Otherwise
+        a single wrong number would make every later command late."""
+        self._last_episode = episode + 1
+
     def command(self, command: Command, now_s: float) -> Outputs:
         """Decides a command, repeats the decision for a duplicate, holds or drops it."""
+        if command.episode > self._last_episode:
+            self.ahead[command.robot] += 1
+            return ()
         key = (command.episode, command.step)
         done = self._done[command.robot]
         if key == done:

@@ -37,17 +37,32 @@ class Report(NamedTuple):
 class TeamHealth:
     """Args: ``cmd_timeout_s``: a robot that no command came from for so long is lost.
 
-    Times are a steady clock's, in seconds.
+    Times are a steady clock's, in seconds. Where it is told of the sim's steps, only the time in
+    which the sim goes on counts: while it is paused nobody is asked, so nobody is silent.
     """
 
     def __init__(self, n_robots: int, cmd_timeout_s: float) -> None:
         self._timeout_s = cmd_timeout_s
         self._heard_s = [_NEVER_S] * n_robots
         self._intruders: list[tuple[str, ...]] = [()] * n_robots
+        self._gap_s = cmd_timeout_s / 2  # between two steps; what is longer does not count
+        self._moved_s: float | None = None  # None: nobody tells of a sim
+        self._stood_s = 0.0
+
+    def sim_moved(self, now_s: float) -> None:
+        """The sim has made a step."""
+        if self._moved_s is not None:
+            self._stood_s += max(0.0, now_s - self._moved_s - self._gap_s)
+        self._moved_s = now_s
+
+    def _counted_s(self, now_s: float) -> float:
+        if self._moved_s is None:
+            return now_s
+        return min(now_s, self._moved_s + self._gap_s) - self._stood_s
 
     def heard(self, robot: int, now_s: float) -> None:
         """A command of ``robot`` came, whatever became of it."""
-        self._heard_s[robot] = now_s
+        self._heard_s[robot] = self._counted_s(now_s)
 
     def intruders(self, robot: int, who: tuple[str, ...]) -> None:
         """Who else publishes on the robot's command topic now; empty: nobody."""
@@ -55,7 +70,7 @@ class TeamHealth:
 
     def state(self, robot: int, mode: str, now_s: float) -> RobotState:
         """A robot whose commands stay away is lost even where a plan mutes it."""
-        if now_s - self._heard_s[robot] >= self._timeout_s:
+        if self._counted_s(now_s) - self._heard_s[robot] >= self._timeout_s:
             return RobotState.LOST
         return RobotState.MUTED if mode else RobotState.OK
 
@@ -66,7 +81,9 @@ class TeamHealth:
     def _report(self, robot: int, at: Decided, now_s: float) -> Report:
         state = self.state(robot, at.mode, now_s)
         text = f"{state.value} ({at.mode})" if state is RobotState.MUTED else state.value
-        age_s = now_s - self._heard_s[robot]
+        if self._moved_s is not None and now_s - self._moved_s >= self._timeout_s:
+            text += "; the sim stands still"
+        age_s = self._counted_s(now_s) - self._heard_s[robot]
         values = [
             ("state", state.name.lower()),
             ("mode", at.mode),

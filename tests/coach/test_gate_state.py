@@ -49,6 +49,20 @@ def test_real_time_never_holds() -> None:
     assert brief(state.command(command(0, 6, 0), 0.0)) == [(0, 6, 0, "", 3)]
 
 
+@pytest.mark.parametrize("absurd", [7, 2**32 - 1])
+def test_an_episode_after_the_next_makes_nothing_late(absurd: int) -> None:
+    state = gate(lockstep=False)
+    state.boundary(5)
+    assert state.command(command(0, absurd, 3), 0.0) == ()
+    assert brief(state.command(command(0, 5, 0), 0.0)) == [(0, 5, 0, "", 3)]
+    # The next one: the robot may hear of it before this gate does.
+    assert brief(state.command(command(1, 6, 0), 0.0)) == [(1, 6, 0, "", 3)]
+    assert (state.ahead, state.late) == ([1, 0], [0, 0])
+    state.boundary(7)  # two more have begun while nothing came from the robots
+    assert brief(state.command(command(0, 7, 0), 0.0)) == [(0, 7, 0, "", 3)]
+    assert state.ahead == [1, 0]
+
+
 def test_next_step_is_the_first_step_that_nothing_was_relayed_of() -> None:
     state = gate()
     state.plan(plan(0, 1), LEASE_S, 0.0)

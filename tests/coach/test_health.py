@@ -21,6 +21,43 @@ def test_a_robot_is_ok_muted_or_lost() -> None:
     assert report(health, "", 10.7).state is RobotState.OK
 
 
+def test_time_stands_while_the_sim_does() -> None:
+    """A pause of any length loses nobody, neither in it nor as the sim goes on; silence does."""
+    health = TeamHealth(2, TIMEOUT_S)
+
+    def step(now_s: float, *robots: int) -> None:
+        health.sim_moved(now_s)
+        for robot in robots:
+            health.heard(robot, now_s + 0.01)
+
+    def states(now_s: float) -> list[RobotState]:
+        return [r.state for r in health.reports([Decided(), Decided()], now_s)]
+
+    for k in range(10):
+        step(0.1 * k, 0, 1)
+    assert states(0.95) == [RobotState.OK, RobotState.OK]
+    for now_s in (1.5, 60.0, 7200.0):  # paused
+        assert states(now_s) == [RobotState.OK, RobotState.OK]
+    assert "stands still" in report(health, "", 60.0).text
+    step(7200.1)  # a single step, not answered yet; then on
+    assert states(7200.1) == [RobotState.OK, RobotState.OK]
+    for k in range(10):
+        step(7300.0 + 0.1 * k, 0)  # robot 1 stays silent
+    assert states(7300.95) == [RobotState.OK, RobotState.LOST]
+    assert report(health, "", 7300.95).text == "ok"
+    assert states(9000.0) == [RobotState.OK, RobotState.LOST]  # and a pause does not bring it back
+
+
+def test_a_step_that_takes_long_counts_in_part() -> None:
+    """Steps further apart than half the timeout: a silent robot is lost, if later."""
+    health = TeamHealth(1, TIMEOUT_S)
+    health.sim_moved(0.0)
+    health.heard(0, 0.01)
+    for k in (1, 2, 3):
+        health.sim_moved(float(k))
+    assert report(health, "", 3.0).state is RobotState.LOST
+
+
 def test_a_silent_robot_is_lost_even_where_a_plan_mutes_it() -> None:
     health = TeamHealth(1, TIMEOUT_S)
     assert report(health, "mute", 0.0).state is RobotState.LOST

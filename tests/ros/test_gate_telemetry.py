@@ -14,6 +14,7 @@ from coach_graph import NEWEST, PLAN, ROBOTS, Graph, Team, graph, process, team
 from crash_coach_interfaces.msg import Action, CrashPlan, Fault, FaultEvent, Observation
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
 
 FREEZE_1 = {"victims": ("robot_1",), "crash_mode": "freeze", "start_step": 2}
 
@@ -125,6 +126,39 @@ def test_diagnostics_tell_ok_muted_and_lost(ros_env: dict[str, str]) -> None:
         assert (values["mode"], values["step"]) == ("random", "2")
         lost = listener.status(2, lambda s: s.level == DiagnosticStatus.ERROR, "lost")
         assert lost["state"] == "lost"
+
+
+def test_in_real_time_a_pause_loses_nobody_and_a_wrong_episode_blocks_nobody(
+    ros_env: dict[str, str],
+) -> None:
+    gate = {"robots": ROBOTS, "lockstep": False, "cmd_timeout_s": 0.6}
+    with process(ros_env, "gate", **gate), team(ros_env) as t:
+        t.meet(coach=False)
+        node, listener = t.node, Listener(t)
+        clock = node.create_publisher(Clock, "/clock", 10)
+        wrong = node.create_publisher(Action, "/robot_1/command_raw", NEWEST)
+        t.until(lambda: wrong.get_subscription_count() > 0, "the gate")
+        t.until(lambda: clock.get_subscription_count() > 0, "the gate")
+        t.until(lambda: node.count_subscribers("/sim/boundary") > 0, "the gate")
+        t.announce(0, 0)
+        t.serve(0.3)
+        wrong.publish(Action(episode=2**32 - 1))
+        t.serve(0.3)  # before the next command takes its place in the queue
+        for step in range(5):
+            clock.publish(Clock())
+            assert not any(outcome.faulted for outcome in t.step(0, step))
+        # Paused: no clock, no observations, no commands.
+        values = listener.status(0, lambda s: "the sim stands still" in s.message, "the pause")
+        assert (values["state"], values["step"]) == ("ok", "4")
+        assert (values["ahead"], values["late"]) == ("1", "0")
+        now = listener.statuses[-1]
+        assert all(now[f"gate: {name}"].level == DiagnosticStatus.OK for name in ROBOTS)
+        told = [status["gate: robot_1"].message for status in listener.statuses]
+        assert sum("has not begun are ignored" in message for message in told) == 1
+        for _ in range(10):  # it goes on, and nobody answers
+            clock.publish(Clock())
+            t.serve(0.1)
+        listener.status(2, lambda s: s.level == DiagnosticStatus.ERROR, "lost")
 
 
 def test_an_intruder_is_told_once_and_its_end(ros_env: dict[str, str]) -> None:

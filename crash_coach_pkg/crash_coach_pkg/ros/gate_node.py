@@ -10,6 +10,8 @@ from functools import partial
 from crash_coach_interfaces.msg import Action, EpisodeState, Observation
 from rclpy.executors import Executor
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
 
 from crash_coach_pkg.effects import WITHHELD
 from crash_coach_pkg.gate_state import GateState
@@ -62,10 +64,15 @@ class ActionGate:
         self._state = GateState(len(robots), lockstep, first_lease_s, self._relays)
         self._watched: set[int] = set()
         self._watches_world = False
-        self._untold = [0] * len(robots)  # as /diagnostics said them last
+        self._told = [(0, 0)] * len(robots)  # untold and ahead, as /diagnostics said them last
         self._commands = [
             base.command_publisher(robot, Action, NEWEST).publish for robot in range(len(robots))
         ]
+        if not lockstep:  # there the sim waits, and says loudly what it does not get
+            base.create_subscription(EpisodeState, "/sim/boundary", self._on_boundary, EPISODE)
+            base.create_subscription(
+                Clock, "/clock", self._on_clock, QoSProfile(depth=10), raw=True
+            )
         self._seen = []
         for robot, name in enumerate(robots):
             base.create_subscription(
@@ -110,13 +117,20 @@ class ActionGate:
         ]
 
     def counters(self, robot: int) -> Sequence[tuple[str, int]]:
-        return (("late", self._state.late[robot]), ("untold", self._state.untold[robot]))
+        state = self._state
+        late, ahead, untold = state.late[robot], state.ahead[robot], state.untold[robot]
+        return (("late", late), ("ahead", ahead), ("untold", untold))
 
     def warning(self, robot: int) -> str:
-        before, self._untold[robot] = self._untold[robot], self._state.untold[robot]
-        if self._untold[robot] == before:
-            return ""
-        return "its policy does not tell its worst action: commands are withheld"
+        before, now = self._told[robot], (self._state.untold[robot], self._state.ahead[robot])
+        self._told[robot] = now
+        told = []
+        if now[0] > before[0]:
+            told.append("its policy does not tell its worst action: commands are withheld")
+        if now[1] > before[1]:
+            told.append("commands for an episode that the sim has not begun are ignored")
+            self._base.get_logger().warning(f"{self._base.robots[robot]}: {told[-1]}")
+        return "; ".join(told)
 
     def close(self) -> None:
         """Nothing is open that the node does not close."""
@@ -143,6 +157,12 @@ class ActionGate:
             self._base.get_logger().error(f"{self._base.robots[robot]}: {error}; ignored")
             return
         self._send(self._state.command(command, now_s))
+
+    def _on_boundary(self, message: EpisodeState) -> None:
+        self._state.boundary(message.episode)
+
+    def _on_clock(self, _: bytes) -> None:
+        self._base.health.sim_moved(time.monotonic())
 
     def _on_observation(self, robot: int, data: bytes) -> None:
         try:
