@@ -194,7 +194,8 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
         if path.is_file():
             text = path.read_text(encoding="utf-8")
         elif packed.is_file():
-            path, text = packed, gzip.decompress(packed.read_bytes()).decode()
+            path = packed  # for the error below
+            text = gzip.decompress(packed.read_bytes()).decode()
         else:
             return []
         return [json.loads(line) for line in text.splitlines()]

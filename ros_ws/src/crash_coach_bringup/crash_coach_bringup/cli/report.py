@@ -164,7 +164,7 @@ def _write(
     # Imported here: no other verb should wait for matplotlib.
     from crash_coach_bringup.cli import report_figures
 
-    drawn = report_figures.write(found, better, out)
+    drawn = report_figures.write(found, better, [each.run for each in results], out)
     if run_seed is not None:
         drawn.append(report_figures.trajectories(results, run_seed, about["seed"], out))
     console.print(text, markup=False, highlight=False, soft_wrap=True)

@@ -1,8 +1,7 @@
-"""The report's figures: success against the number of crashed robots, improvement, trajectories."""
+"""The report's figures: success against crashed robots, improvement, trajectories, curves."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,17 +13,21 @@ from matplotlib.ticker import MaxNLocator
 from crash_coach_bringup.cli.output import CliError
 from crash_coach_bringup.cli.picture import TeamResults, draw_first_episodes
 from crash_coach_bringup.cli.plot import COLOURS, FORMATS, INK, save, style
+from crash_coach_bringup.cli.report_curves import learning_curves
+from crash_coach_bringup.cli.report_panels import COLUMNS, legend_above, panels
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.train.evaluate import evaluate
 from policy_pkg.train.kept_evaluations import Result
 from policy_pkg.train.report import ALL_MAPS, Improvement, Row
+from policy_pkg.train.results import Run
 
-COLUMNS = 4  # of panels
 APART = 0.06  # between the methods' points at the same number of crashed robots
 
 
-def write(rows: Sequence[Row], better: Sequence[Improvement], out: Path) -> list[Path]:
-    """Draws what the rows suffice for, as PNG and SVG; returns the files.
+def write(
+    rows: Sequence[Row], better: Sequence[Improvement], runs: Sequence[Run], out: Path
+) -> list[Path]:
+    """Draws what rows and runs suffice for, as PNG and SVG; returns the files.
 
     Raises:
         CliError: a file cannot be written.
@@ -33,6 +36,8 @@ def write(rows: Sequence[Row], better: Sequence[Improvement], out: Path) -> list
     figures: dict[str, Figure] = {}
     if len({row.crashed for row in exact}) > 1:
         figures["resilience"] = resilience(exact)
+    if (curves := learning_curves(runs)) is not None:
+        figures["curves"] = curves
     if better:
         figures["improvement"] = improvement(better)
     files = []
@@ -50,8 +55,8 @@ def resilience(rows: Sequence[Row]) -> Figure:
     """
     maps = list(dict.fromkeys(row.scenario for row in rows))
     methods = list(dict.fromkeys(row.method for row in rows))
-    figure, panels = _panels(len(maps), width=3.4, height=3.2)
-    for ax, name in zip(panels, maps, strict=True):
+    figure, axes = panels(len(maps), width=3.4, height=3.2)
+    for ax, name in zip(axes, maps, strict=True):
         for index, method in enumerate(methods):
             mine = [row for row in rows if (row.scenario, row.method) == (name, method)]
             _draw_method(ax, mine, index, (index - (len(methods) - 1) / 2) * APART)
@@ -64,8 +69,7 @@ def resilience(rows: Sequence[Row]) -> Figure:
         Line2D([], [], color=style(i)[0], linestyle=style(i)[1], marker="o", label=name)
         for i, name in enumerate(methods)
     ]
-    columns = max(1, int(figure.get_figwidth() / (1.0 + 0.085 * max(map(len, methods)))))
-    figure.legend(handles=handles, loc="outside upper center", ncols=columns, frameon=False)
+    legend_above(figure, handles, methods)
     marks = {"large: mean of the seeds, small: each seed": any(len(r.seeds) > 1 for r in rows)}
     marks["bar: Wilson's 95 % interval of a single seed"] = any(len(r.seeds) == 1 for r in rows)
     text = "; ".join(text for text, there in marks.items() if there)
@@ -92,8 +96,8 @@ def improvement(better: Sequence[Improvement]) -> Figure:
     """A panel per condition: how probable it is that the first method's run beats the second's."""
     conditions = list(dict.fromkeys(each.condition for each in better))
     pairs = list(dict.fromkeys((each.better, each.worse) for each in better))
-    figure, panels = _panels(len(conditions), width=3.0, height=1.0 + 0.3 * len(pairs))
-    for ax, condition in zip(panels, conditions, strict=True):
+    figure, axes = panels(len(conditions), width=3.0, height=1.0 + 0.3 * len(pairs))
+    for ax, condition in zip(axes, conditions, strict=True):
         for each in better:
             if each.condition != condition:
                 continue
@@ -104,26 +108,12 @@ def improvement(better: Sequence[Improvement]) -> Figure:
         ax.set_xlim(-0.03, 1.03)
         ax.set_ylim(len(pairs) - 0.5, -0.5)
         # Panels of one line share the labels of the first.
-        labels = [f"{a} over {b}" for a, b in pairs] if panels.index(ax) % COLUMNS == 0 else []
+        labels = [f"{a} over {b}" for a, b in pairs] if axes.index(ax) % COLUMNS == 0 else []
         ax.set_yticks(range(len(pairs)))
         ax.set_yticklabels(labels or [""] * len(pairs), fontsize=8)
         ax.set_title(condition, fontsize=10, color=INK)
     figure.supxlabel("probability of improvement, 95 % bootstrap interval", fontsize=9, color=INK)
     return figure
-
-
-def _panels(count: int, width: float, height: float) -> tuple[Figure, list[Any]]:
-    columns = min(count, COLUMNS)
-    lines = math.ceil(count / columns)
-    size = (max(5.0, width * columns), height * lines + 0.5)
-    figure = Figure(figsize=size, dpi=160, layout="constrained")
-    panels = list(figure.subplots(lines, columns, squeeze=False).flat)
-    for ax in panels[count:]:
-        ax.remove()
-    for ax in panels[:count]:
-        ax.grid(color="#dddddd", linewidth=0.6)
-        ax.spines[["top", "right"]].set_visible(False)
-    return figure, panels[:count]
 
 
 def trajectories(results: Sequence[Result], run_seed: int, seed: int, out: Path) -> Path:
