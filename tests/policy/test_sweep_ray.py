@@ -56,7 +56,7 @@ def test_a_lost_node_loses_no_run_and_repeats_none(tmp_path: Path) -> None:
 
 @pytest.mark.soak
 @pytest.mark.timeout(300)
-def test_a_node_that_does_not_see_the_folder_is_refused(tmp_path: Path) -> None:
+def test_a_cluster_that_cannot_do_runs_is_refused(tmp_path: Path) -> None:
     from ray.cluster_utils import Cluster
 
     from policy_pkg.train.sweep_ray import RayEngine

@@ -90,19 +90,29 @@ def test_killed_twice_ends_with_the_same_results(tmp_path: Path) -> None:
 
 @pytest.mark.soak
 def test_killed_ten_times_at_random_moments(tmp_path: Path) -> None:
+    """Most of them while it trains, some while it starts."""
     chance = random.Random(7)
-    changes = {"total_steps": 12_000, "seeds": [0, 1]}
-    runs, out = tiny_runs(tmp_path, **changes), tmp_path / "out"
+    runs = tiny_runs(tmp_path, total_steps=20_000, seeds=[0, 1])
+    out = tmp_path / "out"
     train_alone(runs, tmp_path / "alone")
-    killed = 0
+    told = [RunFiles(out, run.name).progress for run in runs]
+    reached = []
     for _ in range(10):
         process = start(tmp_path / "sweep.yaml", out)
-        try:
-            process.communicate(timeout=chance.uniform(0.5, 12))
-        except subprocess.TimeoutExpired:
-            killed += 1
-            kill(process, out)
-    assert killed == 10, "the sweep is too short for ten kills"
+        if chance.random() < 0.7:
+            since_s = time.time()
+            wait_for(
+                lambda since_s=since_s: any(  # type: ignore[misc]
+                    path.exists() and path.stat().st_mtime > since_s for path in told
+                ),
+                process,
+            )
+        time.sleep(chance.uniform(0, 4))
+        assert process.poll() is None, "the sweep is too short for ten kills"
+        kill(process, out)
+        reached.append(steps(runs, out))
+    assert reached == sorted(reached)
+    assert len(set(reached)) >= 4, "hardly a kill came while it trained"
     done = start(tmp_path / "sweep.yaml", out)
     assert "all 4 runs are finished" in done.communicate(timeout=600)[0]
     assert_same_results(runs, out, tmp_path / "alone")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,18 @@ except ModuleNotFoundError as error:
 
 MOST_RETRIES = 10  # of a task whose node was lost
 CHECK_S = 120.0
+CONNECT_S = 10.0
+
+
+def check_reachable(address: str) -> None:
+    """Raises RunError where nobody answers at host:port, which Ray would try for minutes."""
+    host, colon, port = address.rpartition(":")
+    if not colon or "/" in address:
+        return
+    try:
+        socket.create_connection((host, int(port)), CONNECT_S).close()
+    except (OSError, ValueError) as error:
+        raise RunError(f"--address {address}: no Ray cluster: {error}") from error
 
 
 def perform(task: str, mark: str) -> str | None:
@@ -57,6 +70,7 @@ class RayEngine:
         self.slots = slots
         self._tasks: dict[Any, str] = {}
         self._mark = leave_mark(out)
+        check_reachable(address or os.environ.get("RAY_ADDRESS", ""))
         try:
             ray.init(address=address, log_to_driver=False, logging_level="error")
         except (ConnectionError, ValueError, RuntimeError) as error:
