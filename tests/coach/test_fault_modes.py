@@ -13,9 +13,11 @@ from hypothesis import strategies as st
 
 from crash_coach_pkg.action_tools import ActionTools
 from crash_coach_pkg.faults import (
+    fault_mode,
     make_fault,
 )
 from crash_coach_pkg.faults.base import CommandFault, Step
+from crash_coach_pkg.faults.schema import parameters_of
 from crash_coach_pkg.plan import CrashPlan, Fault
 from crash_coach_pkg.team_faults import TeamFaults
 
@@ -153,6 +155,13 @@ def test_drop_in_bursts_follows_gilbert_and_elliott(fits: Callable[..., bool]) -
     counts = [np.sum(bad == k) for k in (1, 2, 3)] + [np.sum(bad > 3)]
     law = [to_good * (1 - to_good) ** k for k in range(3)] + [(1 - to_good) ** 3]
     assert fits(counts, len(bad) * np.array(law))
+
+
+def test_the_example_of_drop_loses_commands_in_bursts() -> None:
+    odds = {info.name: info.example for info in parameters_of(fault_mode("drop"))}
+    lost = losses(5, 20_000, **odds)
+    lasting = (lost[1:] & lost[:-1]).sum() / lost[:-1].sum()  # lost again in the next step
+    assert lasting > 0.5 > 2 * lost.mean()
 
 
 class Velocities:

@@ -44,7 +44,9 @@ def test_the_catalogue() -> None:
         assert fault_mode(name).summary.endswith(".")
         for info in parameters_of(fault_mode(name)):
             assert info.low <= info.default <= info.high
+            assert info.low <= info.example <= info.high
             assert info.unit in ("1", "steps", "m/s", "rad/s")
+        check_parameters(name, {i.name: i.example for i in parameters_of(fault_mode(name))})
 
 
 def test_wrong_names_and_values_are_named() -> None:

@@ -29,7 +29,8 @@ class FaultParameters(BaseModel):
     """Base of a mode's parameters: numbers, each with a range, a description and a unit.
 
     Write a field as ``Field(default=..., ge=..., le=..., description="...",
-    json_schema_extra={"unit": "steps"})``; "1" is the unit of what has none.
+    json_schema_extra={"unit": "steps"})``; "1" is the unit of what has none. ``examples=[...]``
+    is for the documentation; without, it shows the default.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)

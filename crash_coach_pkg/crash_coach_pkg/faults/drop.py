@@ -12,17 +12,20 @@ from crash_coach_pkg.faults.base import C, CommandFault, FaultParameters, Step, 
 _LOSS, _CHANGE = 1, 2  # streams
 
 
-def _probability(default: float, description: str) -> Any:
+def _probability(default: float, example: float, description: str) -> Any:
     return Field(
-        default=default, ge=0, le=1, description=description, json_schema_extra={"unit": "1"}
-    )
+        default=default, ge=0, le=1, description=description, examples=[example],
+        json_schema_extra={"unit": "1"},
+    )  # fmt: skip
 
 
 class DropParameters(FaultParameters):
-    probability: float = _probability(0.5, "Probability that a step's command is lost.")
-    burst_probability: float = _probability(1.0, "The same within a burst.")
-    to_bad: float = _probability(0.0, "Probability per step that a burst begins.")
-    to_good: float = _probability(1.0, "Probability per step that a burst ends.")
+    probability: float = _probability(0.5, 0.02, "Probability that a step's command is lost.")
+    burst_probability: float = _probability(1.0, 0.9, "The same within a burst.")
+    to_bad: float = _probability(0.0, 0.05, "Probability per step that a burst begins.")
+    to_good: float = _probability(
+        1.0, 0.25, "Probability per step that a burst ends: it lasts 1 / to_good steps on average."
+    )
 
 
 class Drop(CommandFault[C]):

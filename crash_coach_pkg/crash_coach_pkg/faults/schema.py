@@ -10,7 +10,7 @@ _KEYS = ("default", "minimum", "maximum", "unit", "description")
 
 
 class ParameterInfo(NamedTuple):
-    """One parameter; ``low`` and ``high`` are allowed values."""
+    """One parameter; ``low``, ``high`` and ``example`` are allowed values."""
 
     name: str
     is_integer: bool
@@ -19,6 +19,7 @@ class ParameterInfo(NamedTuple):
     high: float
     unit: str
     description: str
+    example: float  # for documentation: one that does something, together with the others'
 
 
 def parameters_of(mode: type[FaultMode]) -> tuple[ParameterInfo, ...]:
@@ -42,4 +43,6 @@ def _info(mode: type[FaultMode], name: str, field: dict[str, object]) -> Paramet
     number = int if kind == "integer" else float
     default, low, high = (number(str(field[key])) for key in _KEYS[:3])
     unit, description = (str(field[key]) for key in _KEYS[3:])
-    return ParameterInfo(name, kind == "integer", default, low, high, unit, description)
+    given = field.get("examples")
+    example = number(str(given[0])) if isinstance(given, list) else default or number(high / 20)
+    return ParameterInfo(name, kind == "integer", default, low, high, unit, description, example)

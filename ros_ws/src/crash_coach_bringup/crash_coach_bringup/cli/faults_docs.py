@@ -112,8 +112,8 @@ def _mode(name: str) -> str:
 def _set(mode: str, parameters: Iterable[ParameterInfo]) -> list[tuple[str, str]]:
     values = []
     for p in parameters:
-        value = p.default or p.high / 20  # a value that does something
-        values.append((f"{mode}.{p.name}", str(int(value) if p.is_integer else float(value))))
+        value = int(p.example) if p.is_integer else float(p.example)
+        values.append((f"{mode}.{p.name}", str(value)))
     return [*values, ("crash_mode", mode)]
 
 
