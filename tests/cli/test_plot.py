@@ -23,6 +23,7 @@ from crash_coach_bringup.cli.curves import (
 from crash_coach_bringup.cli.output import CliError
 from crash_coach_bringup.cli.plot import draw, legend, note, plot, targets
 from policy_pkg.train.config import TrainConfig
+from policy_pkg.train.offline_config import OfflineConfig
 from policy_pkg.train.run_dir import prepare_run
 from sim_pkg.contract import UserError
 
@@ -53,6 +54,40 @@ def write_run(
     ]
     (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     return folder
+
+
+def write_offline_run(folder: Path, data: str, test_crashed: tuple[int, ...] = (1,)) -> Path:
+    """A run on recordings as train-offline leaves it."""
+    settings = OfflineConfig(scenario="buttons", gradient_steps=20, test_crashed=test_crashed)
+    prepare_run(folder, settings, False, {"sha256": data})
+    figures = {f"success_{count}_crashed": 0.25 for count in test_crashed}
+    rows = [
+        {
+            "gradient_steps": steps,
+            "success_crash_free": 0.5,
+            **figures,
+            "return_crash_free": 1.0,
+            "loss": None if steps == 0 else 2.0,
+        }
+        for steps in (0, 10, 20)
+    ]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return folder
+
+
+def test_runs_on_recordings_are_drawn_by_gradient_steps(tmp_path: Path) -> None:
+    paths = [write_offline_run(tmp_path / data / "qmix-s0", data) for data in ("one", "two")]
+    plot(paths, tmp_path / "curves", tmp_path / "curves.json")
+    groups = json.loads((tmp_path / "curves.json").read_text())["groups"]
+    assert [group["label"] for group in groups] == ["one/qmix", "two/qmix"]
+    assert groups[0]["runs"][0]["finished"]
+    assert groups[0]["curves"]["loss"]["gradient_steps"] == [10, 20]
+    assert groups[0]["curves"]["success_1_crashed"]["mean"] == [0.25] * 3
+    without = load_run(write_offline_run(tmp_path / "three" / "qmix-s0", "three", (2,)))
+    (group,) = group_runs([without])
+    assert average(group, "success_1_crashed") is None
+    with pytest.raises(CliError, match="in two figures"):
+        group_runs([without, load_run(write_run(tmp_path / "vdn-s0"))])
 
 
 def test_groups_by_config_without_seed(tmp_path: Path) -> None:
@@ -87,7 +122,7 @@ def test_single_run_is_drawn_as_it_is(tmp_path: Path) -> None:
     (group,) = group_runs([load_run(write_run(tmp_path / "qmix-s0"))])
     curve = average(group, "success_rate")
     assert curve is not None
-    assert curve.env_steps.tolist() == [0, 100, 200]
+    assert curve.steps.tolist() == [0, 100, 200]
     assert curve.mean.tolist() == [0.0, 0.5, 1.0]
     assert curve.low is None
     assert curve.high is None
@@ -101,7 +136,7 @@ def test_steps_that_differ_are_interpolated_as_far_as_all_runs_reach(tmp_path: P
     assert curve is not None
     assert curve.low is not None
     assert curve.high is not None
-    assert curve.env_steps.tolist() == [0, 50]
+    assert curve.steps.tolist() == [0, 50]
     # At step 50 the long run lies half way between 0 and 1.
     assert curve.mean.tolist() == [0.0, 0.75]
     assert curve.low.tolist() == [0.0, 0.5]
@@ -115,7 +150,7 @@ def test_points_that_were_not_measured(tmp_path: Path) -> None:
     (group,) = group_runs([load_run(run)])
     curve = average(group, "success_rate")
     assert curve is not None
-    assert curve.env_steps.tolist() == [0, 200]
+    assert curve.steps.tolist() == [0, 200]
     assert average(group, "success_crash_free") is None
 
 

@@ -15,9 +15,6 @@ import numpy.typing as npt
 from crash_coach_bringup.cli.output import CliError
 from policy_pkg.train.run_dir import METRICS, RUN, read_run, seedless_name
 
-STEPS = "env_steps"
-# Keys of metrics.jsonl that are drawn.
-CURVES = ("success_rate", "success_crash_free", "return_mean", "alpha")
 MAX_RANGE_SEEDS = 4
 CONFIDENCE = 0.95
 RESAMPLES = 2000
@@ -27,26 +24,56 @@ Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class Kind:
+    """A kind of run: what its metrics count (``steps``), how long it is (a key of its config), and
+    which of its figures are drawn; ``optional``: those that not every run has."""
+
+    name: str
+    steps: str
+    length: str
+    curves: tuple[str, ...]
+    optional: frozenset[str] = frozenset()
+
+
+TRAINING = Kind(
+    "training in the simulator",
+    "env_steps",
+    "total_steps",
+    ("success_rate", "success_crash_free", "return_mean", "alpha"),
+)
+OFFLINE = Kind(
+    "training on recordings",
+    "gradient_steps",
+    "gradient_steps",
+    ("success_crash_free", "success_1_crashed", "return_crash_free", "loss"),
+    frozenset({"success_1_crashed"}),
+)
+
+
+@dataclass(frozen=True)
 class Run:
     """One run directory.
 
-    ``config``: without ``seed``. ``env_steps``: (B,) of its evaluation blocks, rising.
+    ``config``: without ``seed``. ``steps``: (B,) of its evaluation blocks, rising.
     ``values``: key -> (B,), NaN where the run did not measure it.
+    ``data``: SHA-256 of the recordings of a run on such; else "".
     """
 
     path: Path
+    kind: Kind
     config: Mapping[str, Any]
+    data: str
     seed: int
-    env_steps: Floats
+    steps: Floats
     values: Mapping[str, Floats]
 
     @property
     def total_steps(self) -> int:
-        return int(self.config["total_steps"])
+        return int(self.config[self.kind.length])
 
     @property
     def last_step(self) -> int:
-        return int(self.env_steps[-1])
+        return int(self.steps[-1])
 
     @property
     def finished(self) -> bool:
@@ -55,7 +82,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Group:
-    """Runs that differ in nothing but the seed, in the order of their seeds."""
+    """Runs that differ in nothing but the seed (the recordings, too, are the same), by seed."""
 
     label: str
     runs: tuple[Run, ...]
@@ -76,7 +103,7 @@ class Group:
 class Curve:
     """Mean over the seeds of a group, (P,) each; ``low``, ``high`` None for a single run."""
 
-    env_steps: Floats
+    steps: Floats
     mean: Floats
     low: Floats | None = None
     high: Floats | None = None
@@ -88,24 +115,30 @@ def load_run(path: Path) -> Run:
     Raises:
         UserError: there is no run, or what it holds is damaged; names the file and the line.
     """
-    config = read_run(path).get("config")
+    described = read_run(path)
+    config, data = described.get("config"), described.get("data")
     if not isinstance(config, dict):
         raise CliError(f'{path / RUN}: "config" is missing')
-    for key, least in (("seed", 0), ("total_steps", 1)):
+    kind = TRAINING if data is None else OFFLINE
+    if data is not None and not (isinstance(data, dict) and isinstance(data.get("sha256"), str)):
+        raise CliError(f'{path / RUN}: "data" does not name its recordings')
+    for key, least in (("seed", 0), (kind.length, 1)):
         value = config.get(key)
         if not isinstance(value, int) or value < least:
             raise CliError(f"{path / RUN}: config.{key} is {value!r}, not a number from {least} on")
-    rows = _read_metrics(path / METRICS)
+    rows = _read_metrics(path / METRICS, kind)
     return Run(
         path,
+        kind,
         {key: value for key, value in config.items() if key != "seed"},
+        "" if data is None else data["sha256"],
         config["seed"],
-        np.array([row[STEPS] for row in rows]),
-        {key: np.array([row[key] for row in rows]) for key in CURVES},
+        np.array([row[kind.steps] for row in rows]),
+        {key: np.array([row[key] for row in rows]) for key in kind.curves},
     )
 
 
-def _read_metrics(path: Path) -> list[dict[str, float]]:
+def _read_metrics(path: Path, kind: Kind) -> list[dict[str, float]]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError:
@@ -116,30 +149,32 @@ def _read_metrics(path: Path) -> list[dict[str, float]]:
         raise CliError(f"{path} is empty: the run has not finished its first evaluation block")
     rows: list[dict[str, float]] = []
     for number, line in enumerate(lines, start=1):
-        row = _read_line(line, f"{path}:{number}")
-        if rows and row[STEPS] <= rows[-1][STEPS]:
+        row = _read_line(line, f"{path}:{number}", kind)
+        if rows and row[kind.steps] <= rows[-1][kind.steps]:
             raise CliError(
-                f"{path}:{number}: damaged line: {STEPS} {row[STEPS]:.0f} does not exceed "
-                f"{rows[-1][STEPS]:.0f} of the line before"
+                f"{path}:{number}: damaged line: {kind.steps} {row[kind.steps]:.0f} does not "
+                f"exceed {rows[-1][kind.steps]:.0f} of the line before"
             )
         rows.append(row)
     return rows
 
 
-def _read_line(line: str, place: str) -> dict[str, float]:
+def _read_line(line: str, place: str, kind: Kind) -> dict[str, float]:
     """The drawn figures of a line; null becomes NaN, except for the steps."""
     try:
         content = json.loads(line)
     except json.JSONDecodeError as error:
         raise CliError(f"{place}: damaged line: {error.msg} at column {error.colno}") from None
     if not isinstance(content, dict):
-        raise CliError(f"{place}: damaged line: expected an object with {STEPS} and other figures")
+        raise CliError(
+            f"{place}: damaged line: expected an object with {kind.steps} and other figures"
+        )
     row = {}
-    for key in (STEPS, *CURVES):
-        if key not in content:
+    for key in (kind.steps, *kind.curves):
+        if key not in content and key not in kind.optional:
             raise CliError(f"{place}: damaged line: {key} is missing")
-        value = content[key]
-        if value is None and key != STEPS:
+        value = content.get(key)
+        if value is None and key != kind.steps:
             row[key] = math.nan
         elif isinstance(value, int | float) and type(value) is not bool and math.isfinite(value):
             row[key] = float(value)
@@ -149,14 +184,21 @@ def _read_line(line: str, place: str) -> dict[str, float]:
 
 
 def group_runs(runs: Sequence[Run]) -> list[Group]:
-    """Runs of the same config but for the seed become one group; groups in order of appearance.
+    """Runs of the same config but for the seed, and of the same recordings where they have any,
+    become one group; groups in order of appearance.
 
     Raises:
-        CliError: two runs have the same config and seed: together they would pass for two seeds.
+        CliError: two runs have the same config and seed: together they would pass for two seeds;
+            or there are runs of two kinds.
     """
     groups: dict[str, list[Run]] = {}
     for run in runs:
-        members = groups.setdefault(json.dumps(run.config, sort_keys=True), [])
+        if run.kind != runs[0].kind:
+            raise CliError(
+                f"{runs[0].path} is {runs[0].kind.name}, {run.path} is {run.kind.name}: "
+                "they count other steps; draw them in two figures"
+            )
+        members = groups.setdefault(json.dumps([run.config, run.data], sort_keys=True), [])
         for other in members:
             if other.seed == run.seed:
                 raise CliError(
@@ -198,12 +240,12 @@ def average(group: Group, key: str) -> Curve | None:
         there = ~np.isnan(run.values[key])
         if not there.any():
             return None
-        series.append((run.env_steps[there], run.values[key][there]))
+        series.append((run.steps[there], run.values[key][there]))
     begin = max(steps[0] for steps, _ in series)
     grid = min((steps for steps, _ in series), key=lambda steps: float(steps[-1]))
     grid = grid[grid >= begin]
     if not grid.size:
-        raise CliError(f"the runs of {group.label} share no range of {STEPS} with {key}")
+        raise CliError(f"the runs of {group.label} share no range of steps with {key}")
     rows = np.stack([np.interp(grid, steps, values) for steps, values in series])
     if group.band is None:
         return Curve(grid, rows[0])

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from crash_coach_bringup.cli.curves import (
-    CURVES,
-    STEPS,
     Curve,
     Group,
     average,
@@ -34,8 +32,12 @@ TITLES = {
     "success_crash_free": "success rate without crashes",
     "return_mean": "mean return at the run's crash rate α",
     "alpha": "nominal crash rate α per robot",
+    "success_1_crashed": "success rate with one robot crashed",
+    "return_crash_free": "mean return without crashes",
+    "loss": "loss: what a gradient step lowers",
 }
-PROBABILITIES = {"success_rate", "success_crash_free"}
+STEPS = {"env_steps": "environment steps", "gradient_steps": "gradient steps"}
+PROBABILITIES = {"success_rate", "success_crash_free", "success_1_crashed"}
 # Okabe and Ito's palette, without its yellow, which is too light for a line.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 Dash = Literal["-", "--", "-.", ":"]
@@ -47,7 +49,7 @@ Curves = dict[str, Curve | None]
 
 
 def draw(groups: Sequence[Group], curves: Sequence[Curves]) -> Figure:
-    """One panel per key of CURVES, one line per group; legend and notes below."""
+    """One panel per curve, one line per group, all of one kind; legend and notes below."""
     # Imported here: no other verb should wait for it.
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
@@ -55,10 +57,11 @@ def draw(groups: Sequence[Group], curves: Sequence[Curves]) -> Figure:
     rows = len(groups) + sum(note(group) is not None for group in groups)
     figure = Figure(figsize=(10, 6.6 + 0.2 * rows), dpi=160, layout="constrained")
     axes = figure.subplots(2, 2, sharex=True)
-    for ax, key in zip(axes.flat, CURVES, strict=True):
+    kind = groups[0].runs[0].kind
+    for ax, key in zip(axes.flat, kind.curves, strict=True):
         draw_panel(ax, key, groups, [each[key] for each in curves])
     for ax in axes[-1]:
-        ax.set_xlabel("environment steps", color=INK)
+        ax.set_xlabel(STEPS[kind.steps], color=INK)
     handles = [
         Line2D([], [], color=colour, linestyle=dash, label=legend(group))
         for group, (colour, dash) in zip(groups, map(style, range(len(groups))), strict=True)
@@ -91,7 +94,7 @@ def draw_panel(ax: Any, key: str, groups: Sequence[Group], curves: Sequence[Curv
             missing.append(group.label)
             continue
         colour, dash = style(index)
-        x, y = curve.env_steps, curve.mean
+        x, y = curve.steps, curve.mean
         ax.plot(x, y, dash, color=colour, linewidth=1.5, zorder=3)
         if curve.low is not None:
             ax.fill_between(x, curve.low, curve.high, color=colour, alpha=0.2, linewidth=0)
@@ -167,19 +170,22 @@ def as_json(group: Group, curves: Curves) -> dict[str, Any]:
             {
                 "path": str(run.path),
                 "seed": run.seed,
-                STEPS: run.last_step,
+                run.kind.steps: run.last_step,
                 "total_steps": run.total_steps,
                 "finished": run.finished,
             }
             for run in group.runs
         ],
-        "curves": {key: curve and _curve_json(curve) for key, curve in curves.items()},
+        "curves": {
+            key: curve and _curve_json(curve, group.runs[0].kind.steps)
+            for key, curve in curves.items()
+        },
     }
 
 
-def _curve_json(curve: Curve) -> dict[str, list[float] | None]:
+def _curve_json(curve: Curve, steps: str) -> dict[str, list[float] | None]:
     return {
-        STEPS: curve.env_steps.tolist(),
+        steps: curve.steps.tolist(),
         "mean": curve.mean.tolist(),
         "low": None if curve.low is None else curve.low.tolist(),
         "high": None if curve.high is None else curve.high.tolist(),
@@ -201,7 +207,9 @@ def plot(
     check_json_target(json)
     files = targets(out)
     groups = group_runs([load_run(path) for path in runs])
-    curves: list[Curves] = [{key: average(group, key) for key in CURVES} for group in groups]
+    curves: list[Curves] = [
+        {key: average(group, key) for key in group.runs[0].kind.curves} for group in groups
+    ]
     figure = draw(groups, curves)
     for kind, path in files.items():
         save(figure, path, kind)
