@@ -131,7 +131,7 @@ def _conclude(work: Sweep, stopped: int, command: list[str]) -> None:
         _print(f"{name} failed: {why.splitlines()[0]}")
     left = sum(not each.done for each in work.standings.values())
     if not left:
-        _print(f"all {len(work.runs)} runs are finished, in {work.out}")
+        _print(f"all {len(work.runs)} runs are finished")
         return
     how = f"{shlex.join(command)} goes on from the runs' checkpoints"
     if stopped:
