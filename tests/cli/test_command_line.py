@@ -43,17 +43,46 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_options_take_several_values() -> None:
-    given = ["evaluate", "run", "--crashed", "0", "1", "2", "--mode", "stay", "--json", "x"]
-    expected = [
-        *("evaluate", "run", "--crashed", "0", "--crashed", "1", "--crashed", "2"),
-        *("--mode", "stay", "--json", "x"),
-    ]
-    assert repeat_options(given) == expected
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (
+            "evaluate run --crashed 0 1 2 --mode stay --json x",
+            "evaluate run --crashed 0 --crashed 1 --crashed 2 --mode stay --json x",
+        ),
+        ("train a --seed 1 -2", "train a --seed 1 --seed -2"),
+        ("evaluate run --victims a b --seed 3", "evaluate run --victims a --victims b --seed 3"),
+        ("inject --victims a b", "inject --victims a --victims b"),
+        # An option with one value here, with several elsewhere.
+        ("evaluate --seed 1 run", "evaluate --seed 1 run"),
+        ("render --crash-rate 0.1 run --out x", "render --crash-rate 0.1 run --out x"),
+        ("faults run --seed 1 mute", "faults run --seed 1 mute"),
+        # What is no value of the option any more is the argument.
+        ("evaluate --crashed 0 1 run", "evaluate --crashed 0 --crashed 1 run"),
+        ("train --set a=1 b.c=2 x y", "train --set a=1 --set b.c=2 x y"),
+        ("train-offline cfg --seed 1 2 bag", "train-offline cfg --seed 1 --seed 2 bag"),
+        ("calibrate maps --policy a b", "calibrate maps --policy a --policy b"),
+        ("evaluate --victims=a run", "evaluate --victims=a run"),
+        ("evaluate --crashed x --help", "evaluate --crashed x --help"),
+        ("evalute --crashed 0 1", "evalute --crashed 0 1"),
+        ("", ""),
+    ],
+)
+def test_options_take_several_values(given: str, expected: str) -> None:
+    assert repeat_options(given.split()) == expected.split()
 
 
-def test_negative_values_are_values() -> None:
-    assert repeat_options(["--seed", "1", "-2"]) == ["--seed", "1", "--seed", "-2"]
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("evaluate --victims robot_1 run", "no TEAM: --victims takes everything up to the next"),
+        ("render --victims robot_1 run --out x", "give TEAM first"),
+        ("calibrate --policy kite skirmish/3m --episodes 4", "no SCENARIO: --policy takes every"),
+    ],
+)
+def test_an_argument_that_an_option_took_is_named(given: str, message: str) -> None:
+    with pytest.raises(CliError, match=message):
+        repeat_options(given.split())
 
 
 def test_conditions_in_order() -> None:

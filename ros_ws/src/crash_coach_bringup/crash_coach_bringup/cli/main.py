@@ -27,13 +27,8 @@ from crash_coach_bringup.cli import (
     train_offline,
     up,
 )
+from crash_coach_bringup.cli.several import expand
 from sim_pkg.contract import UserError
-
-# Options that take several values, up to the next option: --crashed 0 1 2
-SEVERAL = {
-    "--crash-rate", "--crashed", "--victims", "--set", "--seed", "--policy", "--param", "--robots",
-    "--have",
-}  # fmt: skip
 
 app = typer.Typer(
     name="crash-coach",
@@ -64,20 +59,8 @@ app.command("calibrate")(calibrate.calibrate)
 
 
 def repeat_options(arguments: list[str]) -> list[str]:
-    """['--crashed', '0', '1'] -> ['--crashed', '0', '--crashed', '1']"""
-    if arguments[:1] == ["faults"]:  # none of its options takes several values
-        return arguments
-    out: list[str] = []
-    option, values = "", 0
-    for argument in arguments:
-        if argument.startswith("-") and not argument.lstrip("-")[:1].isdigit():
-            option, values = argument, 0
-        elif option in SEVERAL:
-            values += 1
-            if values > 1:
-                out.append(option)
-        out.append(argument)
-    return out
+    """The command line as typer reads it. Raises CliError as ``several.expand``."""
+    return expand(arguments, typer.main.get_command(app))
 
 
 def main() -> None:
