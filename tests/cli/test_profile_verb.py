@@ -6,8 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from click.testing import Result
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from crash_coach_bringup.cli.main import app, repeat_options
 from crash_coach_bringup.cli.output import CliError
@@ -15,15 +14,15 @@ from crash_coach_bringup.cli.profile import HINTS, TITLES, hints, summary
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.profile import PARTS, Profile
 
-CONFIG = TrainConfig(scenario="buttons")
+CONFIG = TrainConfig.model_validate({"scenario": "buttons"})
 
 
-def measured(**seconds: float) -> Profile:
-    """1000 steps; a part takes so long, and half of that of the processor."""
+def measured(busy: float = 0.5, **seconds: float) -> Profile:
+    """1000 steps; a part takes so long, and a share ``busy`` of that of the processor."""
     spent = {**dict.fromkeys(PARTS, 0.0), **seconds}
-    half = {part: value / 2 for part, value in spent.items()}
+    cpu = {part: busy * value for part, value in spent.items()}
     calls = {part: int(value > 0) for part, value in spent.items()}
-    return Profile(spent, half, calls, 0.05, 1000, 50, 10, 0, 0.5)
+    return Profile(spent, cpu, calls, 0.05, 1000, 50, 10, 0, 0.5)
 
 
 def test_every_part_has_a_title_and_a_hint() -> None:
@@ -35,12 +34,23 @@ def test_hints_begin_with_the_longest_part_and_leave_out_the_short_ones() -> Non
     assert [line.split(":")[0] for line in found] == ["learner, 68 %", "physics, 30 %"]
 
 
+def test_hints_beside_other_programs_go_by_the_processor() -> None:
+    result = measured(physics=3.0, learner=6.8)
+    result.cpu_seconds["learner"] = 0.5
+    found = hints(result)
+    assert [line.split(":")[0] for line in found] == ["physics, 75 %", "learner, 25 %"]
+    waits = measured(1.0, checkpoint=5.0, learner=5.0)
+    waits.cpu_seconds["checkpoint"] = 4.5  # the rest of it is the disk's
+    assert [line.split(":")[0] for line in hints(waits)] == ["learner, 50 %", "checkpoints, 50 %"]
+
+
 def test_the_summary_says_what_the_table_does_not() -> None:
     text = "\n".join(summary(measured(learner=8.0, physics=2.0), CONFIG))
     assert "100 steps/s: 1,000 environment steps" in text
     assert "10 gradient steps of 400.0 ms" in text
     assert "a core for 50 % of the time" in text
     assert "a core of its own 200 steps/s" in text
+    assert "of the time only" not in "\n".join(summary(measured(1.0, learner=8.0), CONFIG))
     # A block of 0.5 s every 10,000 steps of 10 ms.
     assert "blocks in this time: 0; one takes 0.50 s, which every 10,000 steps is 0.5 %" in text
     assert "no checkpoint in this time; there is one every 100,000" in text

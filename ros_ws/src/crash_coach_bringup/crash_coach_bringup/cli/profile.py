@@ -83,8 +83,8 @@ def summary(result: Profile, config: TrainConfig) -> list[str]:
     if busy < BUSY:
         lines.append(
             f"this process had a core for {100 * busy:.0f} % of the time only, because other "
-            "programs ran or it waited for the disk; with a core of its own "
-            f"{result.env_steps / result.cpu_s:,.0f} steps/s"
+            "programs ran or it waited for the disk: go by the CPU's seconds; with a core of its "
+            f"own {result.env_steps / result.cpu_s:,.0f} steps/s"
         )
     share = result.evaluation_share(config.test_interval_steps)
     lines.append(
@@ -101,12 +101,17 @@ def summary(result: Profile, config: TrainConfig) -> list[str]:
 
 
 def hints(result: Profile) -> list[str]:
-    """What makes the parts that take the most time faster, the longest first."""
-    longest = sorted(TITLES, key=lambda part: -result.share(part))
+    """What makes the parts that take the most time faster, the longest first.
+
+    Beside other programs parts are judged by the processor's time: who was interrupted is chance.
+    """
+    judged = result.seconds if result.cpu_s >= BUSY * result.wall_s else result.cpu_seconds
+    total_s = sum(judged.values())
+    longest = sorted(TITLES, key=lambda part: -judged[part])
     return [
-        f"{TITLES[part]}, {100 * result.share(part):.0f} %: {HINTS[part]}"
+        f"{TITLES[part]}, {100 * judged[part] / total_s:.0f} %: {HINTS[part]}"
         for part in longest
-        if result.share(part) >= WORTH_A_HINT
+        if judged[part] >= WORTH_A_HINT * total_s
     ]
 
 
