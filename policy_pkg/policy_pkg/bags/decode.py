@@ -30,6 +30,7 @@ _READ = {
         "header", "episode", "step", "seed", "state", "reward", "terminated", "truncated",
         "success", "crashed", "actions", "trajectory_hash",
     ),
+    Kind.PLAN: ("header", "episode", "revision", "seed", "rate", "cap", "faults"),
     Kind.EVENT: ("kind", "episode", "step", "robot", "mode", "intent", "applied"),
 }  # fmt: skip
 _SAME = {Kind.SEEN: Kind.OBSERVATION, Kind.COMMAND: Kind.INTENT}

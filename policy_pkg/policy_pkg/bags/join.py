@@ -31,6 +31,7 @@ class Pieces:
     end: Any = None  # EpisodeState with terminated or truncated
     effects: dict[Key, Any] = field(default_factory=dict)  # FaultEvents of commands
     observed: dict[Key, Any] = field(default_factory=dict)  # FaultEvents of observations
+    plan: Any = None  # CrashPlan of the highest revision
     conflicts: dict[str, None] = field(default_factory=dict)
     nbytes: int = 0
 
@@ -72,6 +73,10 @@ class Pieces:
         known = events.setdefault((event.step, robot), event)
         if (known.mode, known.intent, known.applied) != (event.mode, event.intent, event.applied):
             self.conflict(f"two different effects on {event.robot}, step {event.step}")
+
+    def add_plan(self, plan: Any) -> None:
+        if self.plan is None or plan.revision > self.plan.revision:
+            self.plan = plan
 
 
 def _same_situation(one: Any, other: Any) -> bool:
@@ -180,6 +185,8 @@ class Joiner:
         before = pieces.nbytes
         if kind is Kind.STATE:
             pieces.add_state(message, data)
+        elif kind is Kind.PLAN:
+            pieces.add_plan(message)
         elif message.robot in self._robots:
             pieces.add_event(message, self._robots[message.robot])
         else:
@@ -195,7 +202,7 @@ class Joiner:
 
     def _learn(self, channel: Channel) -> tuple[Kind, str, int] | None:
         match = kind_of(channel.topic)
-        if match is None or match[0] is Kind.PLAN:  # what came of a plan, events and states tell
+        if match is None:
             return None
         kind, robot = match
         problem = self.decoder.learn(channel, kind)

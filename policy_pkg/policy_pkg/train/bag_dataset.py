@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from crash_coach_pkg.faults import mode_code
+from crash_coach_pkg.plan import CrashPlan
 from policy_pkg.bags.about import About, same_scenario
 from policy_pkg.bags.assemble import (
     ContradictionError,
@@ -25,6 +26,7 @@ from policy_pkg.bags.join import MEMORY_BYTES, Joiner, Pieces
 from policy_pkg.bags.problems import BagError, Problem, Report, Severity, refuse
 from policy_pkg.bags.topics import Kind
 from policy_pkg.train.episode import Episode
+from policy_pkg.train.recorded_plan import read_plan
 from sim_pkg.contract import IntArray, UserError
 from sim_pkg.trajectory import TrajectoryHash
 
@@ -46,6 +48,7 @@ class RecordedEpisode:
     episode: Episode
     intents: IntArray  # (T, n) actions that the policies wanted; -1 where not recorded
     success: bool
+    plan: CrashPlan | None  # last revision that came before the episode was complete, if any
     modes: dict[tuple[int, int], str]  # names of faults by (step, robot)
     trajectory_hash: str
     scenario: str = ""  # name or file, as the recorder was told; "": not told
@@ -203,7 +206,7 @@ def recorded_episode(
 
     Raises:
         ContradictionError, IncompleteError: what is wrong, or missing.
-        ValueError: a fault that does not exist.
+        ValueError: a plan or fault that does not exist.
     """
     end = joined.end
     _check_hash(joined)
@@ -224,6 +227,7 @@ def recorded_episode(
         episode=episode,
         intents=joined.intents,
         success=bool(end.success),
+        plan=read_plan(pieces.plan, robots) if pieces.plan is not None else None,
         modes={**joined.observed, **joined.modes},
         trajectory_hash=end.trajectory_hash,
     )
