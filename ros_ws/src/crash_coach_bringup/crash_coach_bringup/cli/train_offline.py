@@ -74,9 +74,7 @@ def train_offline(
     ] = None,
     resume: Annotated[
         bool,
-        typer.Option(
-            "--resume", help="Continue from the newest checkpoint; what is finished stays."
-        ),
+        typer.Option("--resume", help="Go on from the newest checkpoint; what is finished stays."),
     ] = False,
     strict: Annotated[
         bool, typer.Option("--strict", help="Refuse recordings with any problem.")
@@ -100,8 +98,8 @@ def train_offline(
                 progress=_Bar(bars, tasks[run]).show,
                 sources=[str(path) for path in bags],
             )
+            steps, episodes = summary.gradient_steps, summary.episodes
             console.print(
-                f"{summary.gradient_steps:,} gradient steps on {summary.episodes:,} episodes "
-                f"in {summary.wall_s:.0f} s"
+                f"{steps:,} gradient steps on {episodes:,} episodes in {summary.wall_s:.0f} s"
             )
             console.print(f"  checkpoint: {run}", soft_wrap=True)
