@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -55,9 +56,7 @@ def plan_runs(
 def train_offline(
     config: Annotated[
         str,
-        typer.Argument(
-            help="Configuration: a name such as offline/conservative_qmix, or a YAML file."
-        ),
+        typer.Argument(help="A name such as offline/conservative_qmix, or a YAML file."),
     ],
     bags: Annotated[
         list[Path],
@@ -81,7 +80,17 @@ def train_offline(
     ] = False,
 ) -> None:
     """Trains a team on recorded episodes, without a simulator. Recordings are read once."""
-    runs = plan_runs(config, out, override or [], seed or [])
+    train_runs(plan_runs(config, out, override or [], seed or []), bags, resume, strict)
+
+
+def train_runs(
+    runs: Mapping[Path, OfflineConfig], bags: Sequence[Path], resume: bool, strict: bool
+) -> None:
+    """One run after another, whose configs differ in nothing but the seed.
+
+    Raises:
+        UserError: as ``policy_pkg.train.offline``.
+    """
     # Imported here: the other verbs do without torch.
     from policy_pkg.train import offline
 
