@@ -8,6 +8,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from in_process import refused
 
 from crash_coach_bringup.cli.crash_options import conditions, mode_parameters
 from crash_coach_bringup.cli.main import repeat_options
@@ -26,14 +27,6 @@ def crash_coach(
     """Runs the installed command."""
     command = [str(find_executable("crash_coach_bringup", "crash-coach")), *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=90, env=env)
-
-
-def refused(*arguments: str) -> str:
-    """The one line with which the command refuses; no traceback, exit code 1 or 2."""
-    done = crash_coach(*arguments)
-    assert done.returncode in (1, 2), done.stdout + done.stderr
-    assert "Traceback" not in done.stderr
-    return done.stderr
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "bags"))
 from bag_maker import Team, messages, played, write
+from in_process import refused, typed
 
 from crash_coach_bringup.cli import calibrate
 from crash_coach_bringup.cli.main import main
@@ -35,14 +36,6 @@ def render(*arguments: str) -> str:
     done = crash_coach("render", *arguments)
     assert done.returncode == 0, done.stderr
     return done.stdout
-
-
-def refused(*arguments: str) -> str:
-    """The one line with which the command refuses."""
-    done = crash_coach(*arguments)
-    assert done.returncode in (1, 2), done.stdout + done.stderr
-    assert "Traceback" not in done.stderr
-    return done.stderr
 
 
 def test_it_draws_the_episode_that_evaluate_plays(tmp_path: Path) -> None:
@@ -154,7 +147,7 @@ def test_a_wrong_scripted_team_is_named() -> None:
 
 def test_calibrate_counts_wins_and_losses(tmp_path: Path) -> None:
     out = tmp_path / "calibration.json"
-    done = crash_coach(
+    done = typed(
         *("calibrate", "skirmish/3m", "buttons", "--policy", "random", "hold"),
         *("--crashed", "0", "1", "--episodes", "8", "--json", str(out)),
     )
@@ -203,6 +196,6 @@ def test_calibrate_refuses_what_it_cannot_play() -> None:
     assert "does not play scenario 'buttons'" in refused(
         "calibrate", "buttons", "--policy", "kite", "--episodes", "1"
     )
-    done = crash_coach("calibrate", "buttons", "coverag", "--policy", "hold", "--episodes", "1")
+    done = typed("calibrate", "buttons", "coverag", "--policy", "hold", "--episodes", "1")
     assert "unknown scenario 'coverag' (did you mean 'coverage'?)" in done.stderr
     assert done.stdout == "", "refused before anything is played"
