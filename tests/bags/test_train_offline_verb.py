@@ -13,11 +13,14 @@ import pytest
 from bag_maker import Made, Team, messages, played, write
 
 from crash_coach_bringup.cli.main import main
+from crash_coach_bringup.cli.report import report
+from crash_coach_bringup.cli.report_success import in_recordings
 from crash_coach_bringup.ros.probe import find_executable
 from policy_pkg.bags.about import same_scenario
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.train.bag_dataset import load_episodes
 from policy_pkg.train.offline_data import load_data
+from policy_pkg.train.results import find_runs, read_runs
 
 QUICK = [
     "--set", "gradient_steps=6", "batch_episodes=4", "test_interval_steps=3", "test_episodes=2",
@@ -105,6 +108,20 @@ def test_several_seeds_are_runs_of_their_own(
         metrics = [(run / "metrics.jsonl").read_bytes() for run in (several / "qmix-s2", one)]
         assert metrics[0] == metrics[1]
     assert json.loads((one / "run.json").read_text())["data"]["episodes"] == 5
+
+
+def test_the_report_knows_how_well_the_recorded_team_did(
+    typed: Typed, tmp_path: Path, bags: list[Path], made: list[Made]
+) -> None:
+    runs = tmp_path / "runs"
+    command = ("offline/behaviour_cloning", *bags, "--out", runs, *QUICK, "--seed", "1", "2")
+    assert typed(*command) == (0, "")
+    report([runs], out=tmp_path / "report", episodes=2, crashed=[0])
+    assert (tmp_path / "report" / "success.png").stat().st_size > 500
+    (row,) = json.loads((tmp_path / "report" / "results.json").read_text())["rows"]
+    assert (row["method"], row["seeds"]) == ("behaviour_cloning", [1, 2])
+    rate = sum(one.success for one in made) / len(made)
+    assert in_recordings(read_runs(find_runs([runs]))) == {("buttons", row["method"]): rate}
 
 
 def test_recordings_of_another_scenario_are_refused(

@@ -13,6 +13,7 @@ import pytest
 
 from crash_coach_bringup.cli.collect import collect
 from crash_coach_bringup.cli.output import CliError
+from crash_coach_bringup.cli.plot import FORMATS
 from crash_coach_bringup.cli.report import asked, report
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.results import find_runs, method_name, read_runs, wall_time_s
@@ -65,8 +66,10 @@ def test_report_of_two_methods(
 ) -> None:
     out = tmp_path / "report"
     report([runs], out=out, episodes=16, crashed=[0, 1], crash_rate=[0.1])
-    names = ("table.md", "results.json", "resilience.png", "resilience.svg", "improvement.png")
-    assert all((out / name).stat().st_size > 500 for name in (*names, "improvement.svg"))
+    figures = [
+        f"{name}.{kind}" for name in ("success", "resilience", "improvement") for kind in FORMATS
+    ]
+    assert all((out / name).stat().st_size > 500 for name in ("table.md", "results.json", *figures))
     found = results_of(out)
     assert [(row["condition"], row["method"], row["seeds"]) for row in found["rows"]] == [
         (condition, method, seeds)

@@ -1,4 +1,4 @@
-"""The report's figures: success against crashed robots, improvement, trajectories, curves."""
+"""The report's figures: success, also against crashed robots, improvement, trajectories, curves."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator
 
 from crash_coach_bringup.cli.output import CliError
 from crash_coach_bringup.cli.picture import TeamResults, draw_first_episodes
 from crash_coach_bringup.cli.plot import COLOURS, FORMATS, INK, save, style
 from crash_coach_bringup.cli.report_curves import learning_curves
 from crash_coach_bringup.cli.report_panels import COLUMNS, legend_above, panels
+from crash_coach_bringup.cli.report_success import in_recordings, success
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.train.evaluate import evaluate
 from policy_pkg.train.kept_evaluations import Result
@@ -36,6 +36,8 @@ def write(
     figures: dict[str, Figure] = {}
     if len({row.crashed for row in exact}) > 1:
         figures["resilience"] = resilience(exact)
+    if exact:
+        figures["success"] = success(exact, in_recordings(runs))
     if (curves := learning_curves(runs)) is not None:
         figures["curves"] = curves
     if better:
@@ -62,7 +64,7 @@ def resilience(rows: Sequence[Row]) -> Figure:
             _draw_method(ax, mine, index, (index - (len(methods) - 1) / 2) * APART)
         ax.set_title(name, fontsize=11, color=INK)
         ax.set_ylim(-0.03, 1.03)
-        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+        ax.set_xticks(sorted({row.crashed or 0 for row in rows}))
         ax.set_xlabel("crashed robots", color=INK)
         ax.set_ylabel("success rate", color=INK)
     handles = [
