@@ -69,15 +69,13 @@ def steps(runs: list[SweepRun], out: Path) -> int:
 
 
 @pytest.mark.timeout(300)
-def test_killed_twice_ends_with_the_same_results(tmp_path: Path) -> None:
+def test_a_killed_sweep_ends_with_the_same_results(tmp_path: Path) -> None:
     adaptive = {"adaptive": TINY["methods"]["adaptive"]}
     runs, out = tiny_runs(tmp_path, methods=adaptive), tmp_path / "out"
     train_alone(runs, tmp_path / "alone")
-    for _ in range(2):
-        before = steps(runs, out)
-        process = start(tmp_path / "sweep.yaml", out)
-        wait_for(lambda before=before: steps(runs, out) > before, process)  # type: ignore[misc]
-        kill(process, out)
+    process = start(tmp_path / "sweep.yaml", out)
+    wait_for(lambda: steps(runs, out) > 0, process)
+    kill(process, out)
     done = start(tmp_path / "sweep.yaml", out)
     assert "all 1 runs are finished" in done.communicate(timeout=100)[0]
     assert done.returncode == 0
