@@ -151,6 +151,7 @@ class Episodes:
         self._client.until(lambda: self.newest >= max(start, 0) + 3, WAIT_S, "more episodes")
 
 
+@pytest.mark.soak
 def test_in_real_time_the_graph_outlives_a_trainer_that_is_killed_and_returns(
     tmp_path: Path,
 ) -> None:
