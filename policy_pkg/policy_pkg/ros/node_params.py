@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
-
-from pydantic import BaseModel, ValidationError
-from rcl_interfaces.msg import ParameterDescriptor
+from pydantic import BaseModel
 from rclpy.node import Node
 
 from sim_pkg.contract import UserError
-from sim_pkg.ros.parameter_service import CheckedParameterService
-
-_OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides")
-
-Model = TypeVar("Model", bound=BaseModel)
+from sim_pkg.ros.parameter_service import (
+    CheckedParameterService,
+    Model,
+    declare_model,
+    unknown_parameter,
+)
 
 
 def read_model(node: Node, model: type[Model]) -> Model:
@@ -26,26 +24,12 @@ def read_model(node: Node, model: type[Model]) -> Model:
     """
     CheckedParameterService(node)
     known = model.model_fields
-    for name in node._parameter_overrides:
-        if name not in known and name.split(".")[0] not in _OF_RCLPY:
-            raise UserError(
-                f"unknown parameter {name!r} of {node.get_name()}; known: {', '.join(known)}"
-            )
-    values = {}
-    for name, about in known.items():
-        # Typed by the model, which says more than a type mismatch in rclpy does.
-        descriptor = ParameterDescriptor(
-            description=about.description, read_only=True, dynamic_typing=True
+    name = unknown_parameter(node, known)
+    if name is not None:
+        raise UserError(
+            f"unknown parameter {name!r} of {node.get_name()}; known: {', '.join(known)}"
         )
-        value = node.declare_parameter(name, about.default, descriptor).value
-        scalar = value is None or isinstance(value, str | int | float)
-        values[name] = value if scalar else list(value)
-    try:
-        return model.model_validate(values)
-    except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        name = ".".join(map(str, problem["loc"]))
-        raise UserError(f"parameter {name} = {problem['input']!r}: {problem['msg']}") from error
+    return declare_model(node, model)
 
 
 def require(node: Node, parameters: BaseModel, *names: str) -> None:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
-from pydantic import ConfigDict, Field, ValidationError
-from rcl_interfaces.msg import ParameterDescriptor
+from pydantic import ConfigDict, Field
 from rclpy.node import Node
 
 from sim_pkg.config import ConfigError, StrictModel, did_you_mean
-from sim_pkg.ros.parameter_service import CheckedParameterService
-
-_OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides")
+from sim_pkg.ros.parameter_service import (
+    CheckedParameterService,
+    declare_model,
+    unknown_parameter,
+)
 
 
 class SimParameters(StrictModel):
@@ -53,21 +54,9 @@ def read_parameters(node: Node) -> SimParameters:
     """
     CheckedParameterService(node)
     known = SimParameters.model_fields
-    for name in node._parameter_overrides:
-        if name not in known and name.split(".")[0] not in _OF_RCLPY:
-            raise ConfigError(
-                f"unknown parameter {name!r}{did_you_mean(name, known)}; known: {', '.join(known)}"
-            )
-    values: dict[str, Any] = {}
-    for name, field in known.items():
-        # Typed by the model below, which says more than a type mismatch in rclpy does.
-        about = ParameterDescriptor(
-            description=field.description, read_only=True, dynamic_typing=True
+    name = unknown_parameter(node, known)
+    if name is not None:
+        raise ConfigError(
+            f"unknown parameter {name!r}{did_you_mean(name, known)}; known: {', '.join(known)}"
         )
-        values[name] = node.declare_parameter(name, field.default, about).value
-    try:
-        return SimParameters.model_validate(values)
-    except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        name = ".".join(map(str, problem["loc"]))
-        raise ConfigError(f"parameter {name} = {problem['input']!r}: {problem['msg']}") from error
+    return declare_model(node, SimParameters)
