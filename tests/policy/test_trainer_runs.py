@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
+from small_run import SMALL, small
 
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.train.config import TrainConfig
@@ -21,26 +22,6 @@ from policy_pkg.train.session import Session
 from policy_pkg.train.trainer import ProgressReport, TrainError, train
 from sim_pkg.contract import EnvSpec, IntArray, StepResult, UserError
 from sim_pkg.env import Env, make_env
-
-SMALL = {
-    "scenario": "buttons",
-    "total_steps": 1200,
-    "n_envs": 4,
-    "updates_per_episode": 0.5,
-    "batch_episodes": 4,
-    "replay_episodes": 20,
-    "epsilon_anneal_steps": 600,
-    "test_interval_steps": 300,
-    "test_episodes": 4,
-    "checkpoint_interval_steps": 300,
-    "tensorboard": False,
-    "learner": {"hidden": 16, "mixing_hidden": 8, "hypernet_hidden": 8},
-    "coach": {"strategy": "adaptive", "rho": 0.2, "beta": 0.0},
-}
-
-
-def small(**changes: object) -> TrainConfig:
-    return TrainConfig.model_validate({**SMALL, **changes})
 
 
 def lines(run: Path, name: str = "metrics.jsonl") -> list[dict[str, object]]:
