@@ -12,13 +12,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 
-from crash_coach_bringup.cli.plot import INK, style
+from crash_coach_bringup.cli.plot import INK, STEPS, style
 from crash_coach_bringup.cli.report_panels import legend_above, panels
 from policy_pkg.train.results import Run, read_lines
 from policy_pkg.train.run_dir import METRICS
 
 SUCCESS = "success_crash_free"
-AXES = {"env_steps": "environment steps", "gradient_steps": "gradient steps"}
 BLOCKS = 10  # of the running mean
 
 Floats = npt.NDArray[np.float64]
@@ -42,7 +41,7 @@ def read_curve(run: Run) -> Curve | None:
     """
     lines = [line for line in read_lines(run.path / METRICS) if line.get(SUCCESS) is not None]
     # Runs from recordings have no environment steps.
-    axis = next((key for key in AXES if all(key in line for line in lines)), None)
+    axis = next((key for key in STEPS if all(key in line for line in lines)), None)
     if axis is None or len(lines) < 2:
         return None
     steps = np.array([line[axis] for line in lines], dtype=np.float64)
@@ -80,7 +79,7 @@ def learning_curves(runs: Sequence[Run]) -> Figure | None:
         ax.set_title(name, fontsize=11, color=INK)
         ax.set_ylim(-0.03, 1.03)
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))
-        ax.set_xlabel(" or ".join(dict.fromkeys(AXES[curve.axis] for curve in mine)), color=INK)
+        ax.set_xlabel(" or ".join(dict.fromkeys(STEPS[curve.axis] for curve in mine)), color=INK)
         ax.set_ylabel("success rate without crashes", color=INK)
     handles = [
         Line2D([], [], color=style(i)[0], linestyle=style(i)[1], label=name)
