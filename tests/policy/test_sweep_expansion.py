@@ -54,9 +54,51 @@ def test_a_size_counts_over_the_rest(tmp_path: Path) -> None:
     assert len(load_sweep(path)) == 2
 
 
+def test_settings_of_a_scenario_count_over_those_of_all(tmp_path: Path) -> None:
+    """set < methods < scenario_set, and those of the size over all of them."""
+    path = write_sweep(
+        tmp_path / "sweep.yaml",
+        scenarios=["buttons", "buttons_8"],
+        scenario_set={"buttons_8": {"coach.rho": 0.4, "n_envs": 3, "test_episodes": 7}},
+        sizes={
+            "small": {
+                "methods": ["adaptive"],
+                "set": {"n_envs": 2, "total_steps": 500},
+                "scenario_set": {"buttons": {"total_steps": 300}},
+            }
+        },
+    )
+
+    def settings(size: str) -> dict[str, tuple[float, ...]]:
+        return {
+            run.name: (c.coach.rho, c.n_envs, c.test_episodes, c.total_steps)
+            for run in load_sweep(path, size)
+            for c in [run.config]
+            if c.coach.strategy == "adaptive"
+        }
+
+    assert settings("full") == {
+        "buttons/adaptive-s0": (0.3, 5, 4, 2000),
+        "buttons_8/adaptive-s0": (0.4, 3, 7, 2000),
+    }
+    assert settings("small") == {
+        "buttons/adaptive-s0": (0.3, 2, 4, 300),
+        "buttons_8/adaptive-s0": (0.4, 2, 7, 500),
+    }
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"scenario_set": {"buttons_9": {}}}, r"sweep\.yaml:\d+: no runs on scenario 'buttons_9'"),
+        (
+            {"sizes": {"s": {"scenarios": ["buttons_8"], "scenario_set": {"buttons": {}}}}},
+            r"sweep\.yaml:\d+: no runs on scenario 'buttons' .*scenarios: buttons_8",
+        ),
+        (
+            {"scenario_set": {"buttons": {"coach.betta": 1}}},
+            r"sweep\.yaml:\d+: unknown key 'coach.betta'.*'beta'",
+        ),
         ({"setings": {}}, r"sweep\.yaml:\d+: unknown key 'setings' .*did you mean 'set'"),
         ({"seeds": []}, r"sweep\.yaml:\d+: seeds = \[\]"),
         ({"seeds": [1, 2, 1]}, "two runs are called buttons/qmix-s1"),

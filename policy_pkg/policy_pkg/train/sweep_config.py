@@ -53,6 +53,9 @@ class SweepSize(StrictModel):
         None, min_length=1, description="names of those that this size has; null: all"
     )
     set: Settings = Field({}, description="settings of every run of this size")
+    scenario_set: dict[str, Settings] = Field(
+        {}, description="settings of a scenario's runs of this size, by the scenario's name"
+    )
 
 
 class SweepConfig(StrictModel):
@@ -63,6 +66,9 @@ class SweepConfig(StrictModel):
 
     config: str = Field(description="training configuration: a name, or path of a .yaml file")
     set: Settings = Field({}, description="settings of every run")
+    scenario_set: dict[str, Settings] = Field(
+        {}, description="settings of a scenario's runs, by its name; they count over a method's"
+    )
     scenarios: tuple[str, ...] = Field(min_length=1, description="names, or paths of .yaml files")
     seeds: tuple[int, ...] = Field(min_length=1, description="training seeds")
     methods: dict[str, Settings] = Field({}, description="settings of each method, by its name")
@@ -70,6 +76,18 @@ class SweepConfig(StrictModel):
         {}, description="values of settings; each combination is a method, named after it"
     )
     sizes: dict[str, SweepSize] = Field({}, description="other sizes, by name")
+
+    @model_validator(mode="after")
+    def _scenarios_are_known(self) -> Self:
+        known = [
+            *self.scenarios,
+            *(name for o in self.sizes.values() for name in o.scenarios or ()),
+        ]
+        _check_scenarios(self.scenario_set, known, ())
+        for size, content in self.sizes.items():
+            own = content.scenarios or self.scenarios
+            _check_scenarios(content.scenario_set, own, ("sizes", size))
+        return self
 
     @model_validator(mode="after")
     def _sizes_fit(self) -> Self:
@@ -175,7 +193,7 @@ class _Expansion:
         seeds = self._chosen("seeds")
         found: dict[str, SweepRun] = {}
         for seed, scenario in product(seeds, scenarios):
-            for method, settings in self._methods():
+            for method, settings in self._methods(scenario):
                 run = self._run(method, settings, scenario, seed)
                 if run.name in found:
                     raise ConfigError(f"{self._tree.path}: two runs are called {run.name}")
@@ -187,13 +205,24 @@ class _Expansion:
         own = getattr(self._size, key)
         return own if own is not None else getattr(self._sweep, key)
 
-    def _methods(self) -> Iterator[tuple[str, list[Setting]]]:
+    def _methods(self, scenario: str) -> Iterator[tuple[str, list[Setting]]]:
+        """Each method's settings on a scenario; the later ones count."""
         common = self._settings(self._sweep.set, ("set",))
-        last = self._settings(self._size.set, (*self._inside, "set"))
+        last = [
+            *self._of_scenario(self._sweep, scenario, ()),
+            *self._settings(self._size.set, (*self._inside, "set")),
+            *self._of_scenario(self._size, scenario, self._inside),
+        ]
         methods = self._sweep.all_methods()
         for name in self._size.methods or methods:
             own = [self._setting(key, value, place) for key, value, place in methods[name]]
             yield name, [*common, *own, *last]
+
+    def _of_scenario(
+        self, level: SweepConfig | SweepSize, scenario: str, inside: tuple[str, ...]
+    ) -> list[Setting]:
+        place = (*inside, "scenario_set", scenario)
+        return self._settings(level.scenario_set.get(scenario, {}), place)
 
     def _settings(self, settings: Mapping[str, Any], place: tuple[str, ...]) -> list[Setting]:
         return [self._setting(key, value, (*place, key)) for key, value in settings.items()]
@@ -247,6 +276,18 @@ def check_fits(config: TrainConfig) -> None:
 @cache
 def _spec(scenario: str) -> EnvSpec:
     return make_env(scenario, 1).spec
+
+
+def _check_scenarios(
+    settings: Mapping[str, Settings], known: Sequence[str], inside: tuple[str, ...]
+) -> None:
+    for name in settings:
+        if name not in known:
+            raise Misplaced(
+                (*inside, "scenario_set", name),
+                f"no runs on scenario {name!r}{did_you_mean(name, known)}; "
+                f"scenarios: {', '.join(known)}",
+            )
 
 
 def _check_name(name: str, place: tuple[str, ...]) -> None:
