@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import subprocess
 import sys
@@ -143,6 +144,20 @@ def test_steps_that_differ_are_interpolated_as_far_as_all_runs_reach(tmp_path: P
     assert curve.high.tolist() == [0.0, 1.0]
     assert not group.finished
     assert note(group) == "qmix: unfinished: seed 1 at 50 of 200 steps"
+
+
+def test_a_collected_run_is_drawn_from_its_compressed_metrics(tmp_path: Path) -> None:
+    path = write_run(tmp_path / "qmix-s0")
+    before = load_run(path)
+    packed = path / "metrics.jsonl.gz"
+    packed.write_bytes(gzip.compress((path / "metrics.jsonl").read_bytes()))
+    (path / "metrics.jsonl").unlink()
+    after = load_run(path)
+    assert after.steps.tolist() == before.steps.tolist()
+    assert after.values["success_rate"].tolist() == [0.0, 0.5, 1.0]
+    packed.write_bytes(gzip.compress(b"{"))
+    with pytest.raises(CliError, match=r"metrics\.jsonl\.gz:1: damaged line"):
+        load_run(path)
 
 
 def test_points_that_were_not_measured(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from sim_pkg.config import (
 
 CONFIGS_DIR = Path(__file__).parent.parent / "configs"
 OFFLINE = "offline"  # its folder is that of `train-offline`
+TRAINING = "training config"
 PAPER = "paper"  # its folder is that of `sweep`
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
@@ -162,12 +163,12 @@ def load_config(
         ConfigError: names the file and line or the override, the key, the value, what is right.
     """
     given = [_parse(text) for text in [*overrides, *([] if seed is None else [f"seed={seed}"])]]
-    return validate(with_settings(load_tree(_find(source, known)), given), model)
+    return validate(with_settings(load_tree(find_config(TRAINING, source, known)), given), model)
 
 
 def load_train_tree(source: str | Path) -> YamlTree:
     """A training config, for ``with_settings`` and ``validate``; found as by ``load_config``."""
-    return load_tree(_find(source, train_config_names()))
+    return load_tree(find_config(TRAINING, source, train_config_names()))
 
 
 def with_settings(base: YamlTree, settings: Iterable[Setting]) -> YamlTree:
@@ -185,7 +186,12 @@ def with_settings(base: YamlTree, settings: Iterable[Setting]) -> YamlTree:
     return _Overridden(base.path, values, base.lines, given)
 
 
-def _find(source: str | Path, known: tuple[str, ...]) -> Path:
+def find_config(what: str, source: str | Path, known: tuple[str, ...]) -> Path:
+    """The file of a shipped config, with or without ``.yaml``, or of a path.
+
+    Raises:
+        ConfigError: neither a known name nor an existing .yaml file; calls it a ``what``.
+    """
     name = str(source).removesuffix(".yaml")
     if name in known and not Path(source).is_file():
         return CONFIGS_DIR / f"{name}.yaml"
@@ -193,7 +199,7 @@ def _find(source: str | Path, known: tuple[str, ...]) -> Path:
     if path.suffix in {".yaml", ".yml"} and path.is_file():
         return path
     raise ConfigError(
-        f"no training config {str(source)!r}{did_you_mean(name, known)}; "
+        f"no {what} {str(source)!r}{did_you_mean(name, known)}; "
         f"known: {', '.join(known)}, or the path of a .yaml file"
     )
 

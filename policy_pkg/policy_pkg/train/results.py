@@ -183,23 +183,38 @@ def last_metrics(run: Path) -> dict[str, Any]:
     return lines[-1] if lines else {}
 
 
-def read_lines(path: Path) -> list[dict[str, Any]]:
-    """JSON lines of ``path``, or of ``path``.gz, which ``collect`` makes; empty without both.
+def read_text(path: Path) -> tuple[Path, str] | None:
+    """The text of ``path``, or of ``path``.gz, which ``collect`` makes, and whose it is; None
+    without both.
 
     Raises:
-        RunError: a damaged file or line.
+        RunError: a damaged file.
     """
     packed = path.with_name(path.name + ".gz")
     try:
         if path.is_file():
-            text = path.read_text(encoding="utf-8")
-        elif packed.is_file():
+            return path, path.read_text(encoding="utf-8")
+        if packed.is_file():
             path = packed  # for the error below
-            text = gzip.decompress(packed.read_bytes()).decode()
-        else:
-            return []
-        return [json.loads(line) for line in text.splitlines()]
+            return path, gzip.decompress(packed.read_bytes()).decode()
     except (OSError, EOFError, ValueError) as error:
+        raise RunError(f"{path} cannot be read: {error}") from error
+    return None
+
+
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """The JSON lines of ``path`` or ``path``.gz; empty without both.
+
+    Raises:
+        RunError: a damaged file or line.
+    """
+    found = read_text(path)
+    if found is None:
+        return []
+    path, text = found
+    try:
+        return [json.loads(line) for line in text.splitlines()]
+    except ValueError as error:
         raise RunError(f"{path} cannot be read: {error}") from error
 
 

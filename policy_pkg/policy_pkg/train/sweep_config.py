@@ -19,6 +19,7 @@ from policy_pkg.train.config import (
     PAPER,
     Setting,
     TrainConfig,
+    find_config,
     load_train_tree,
     with_settings,
 )
@@ -151,15 +152,7 @@ def find_sweep(source: str) -> Path:
     Raises:
         ConfigError: neither a known name nor an existing .yaml file.
     """
-    if source in sweep_names():
-        return CONFIGS_DIR / f"{source}.yaml"
-    path = Path(source)
-    if path.suffix in {".yaml", ".yml"} and path.is_file():
-        return path
-    raise ConfigError(
-        f"no sweep {source!r}{did_you_mean(source, sweep_names())}; "
-        f"known: {', '.join(sweep_names())}, or the path of a .yaml file"
-    )
+    return find_config("sweep", source, sweep_names())
 
 
 def load_sweep(path: Path, size: str = FULL) -> list[SweepRun]:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from crash_coach_bringup.cli.output import CliError
+from policy_pkg.train.results import read_text
 from policy_pkg.train.run_dir import METRICS, RUN, read_run, seedless_name
 
 MAX_RANGE_SEEDS = 4
@@ -110,7 +111,7 @@ class Curve:
 
 
 def load_run(path: Path) -> Run:
-    """Reads ``run.json`` and ``metrics.jsonl``.
+    """Reads ``run.json`` and ``metrics.jsonl``, or the compressed one of a collected run.
 
     Raises:
         UserError: there is no run, or what it holds is damaged; names the file and the line.
@@ -139,12 +140,11 @@ def load_run(path: Path) -> Run:
 
 
 def _read_metrics(path: Path, kind: Kind) -> list[dict[str, float]]:
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        raise CliError(f"{path} is missing: the run has not begun") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise CliError(f"{path} cannot be read: {error}") from error
+    found = read_text(path)
+    if found is None:
+        raise CliError(f"{path} is missing: the run has not begun")
+    path, text = found
+    lines = text.splitlines()
     if not lines:
         raise CliError(f"{path} is empty: the run has not finished its first evaluation block")
     rows: list[dict[str, float]] = []
