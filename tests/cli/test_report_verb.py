@@ -10,39 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from report_cases import write_run
 
 from crash_coach_bringup.cli.collect import collect
 from crash_coach_bringup.cli.output import CliError
 from crash_coach_bringup.cli.plot import FORMATS
 from crash_coach_bringup.cli.report import asked, report
 from policy_pkg.train.config import TrainConfig
-from policy_pkg.train.results import find_runs, method_name, read_runs, wall_time_s
+from policy_pkg.train.results import wall_time_s
 from policy_pkg.train.run_dir import RunError, prepare_run
-from policy_pkg.untrained import write_untrained
 from sim_pkg.contract import UserError
-from sim_pkg.env import make_env
-
-WALL_S = (1.0, 30.0, 60.0, 2.0, 20.0)  # of two processes: the second counts from its own start
-
-
-def write_run(
-    folder: Path,
-    scenario: str = "buttons",
-    seed: int = 0,
-    steps: int = 200,
-    total_steps: int = 200,
-    **settings: Any,
-) -> Path:
-    """A run as training leaves it, of a team with random weights."""
-    config = {"scenario": scenario, "seed": seed, "total_steps": total_steps, **settings}
-    prepare_run(folder, TrainConfig.model_validate(config), resume=False)
-    line = {"env_steps": steps, "gradient_steps": 7, "new_alpha": 0.25}
-    (folder / "metrics.jsonl").write_text(json.dumps(line) + "\n")
-    timing = [{"env_steps": k, "wall_s": s, "steps_per_s": 1.0} for k, s in enumerate(WALL_S)]
-    (folder / "timing.jsonl").write_text("".join(json.dumps(row) + "\n" for row in timing))
-    checkpoint = folder / "checkpoints" / f"step_{steps:09d}"
-    write_untrained(checkpoint, make_env(scenario, 1).spec, seed=seed + 1, hidden=8)
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -153,39 +130,13 @@ def test_maps_are_also_taken_together(tmp_path: Path) -> None:
         report([tmp_path], out=tmp_path / "report", episodes=2, crashed=[0], trajectories=0)
 
 
-@pytest.mark.parametrize(
-    ("folder", "scenario", "coach", "name"),
-    [
-        ("adaptive-s3", "buttons", "adaptive", "adaptive"),
-        ("rho", "buttons", "adaptive", "rho"),
-        ("3m-s0", "skirmish/3m", "none", "qmix"),
-        ("3m-s0", "skirmish/3m", "adaptive", "qmix, adaptive"),
-        ("3m-fix_0.05-s12", "skirmish/3m", "fixed", "fix_0.05"),
-        ("fix-8m-s1", "maps/8m.yaml", "fixed", "fix"),
-        ("83m-s1", "skirmish/3m", "none", "83m"),
-    ],
-)
-def test_method_names(folder: str, scenario: str, coach: str, name: str) -> None:
-    settings = {"learner": {"algorithm": "qmix"}, "coach": {"strategy": coach}}
-    assert method_name(Path("runs") / folder, scenario, settings) == name
-
-
-def test_one_name_for_two_settings_is_told_apart_by_the_folder_above(tmp_path: Path) -> None:
-    write_run(tmp_path / "rmsprop" / "qmix-s0")
-    write_run(tmp_path / "adam" / "qmix-s0", learner={"optimiser": "adam"})
-    found = read_runs(find_runs([tmp_path / "rmsprop", tmp_path / "adam"]))
-    assert [run.method for run in found] == ["rmsprop/qmix", "adam/qmix"]
-
-
-def test_runs_that_cannot_be_seeds_of_one_method_are_refused(tmp_path: Path) -> None:
+def test_runs_that_have_just_begun_are_left_out_and_named(tmp_path: Path) -> None:
     write_run(tmp_path / "qmix-s0")
-    write_run(tmp_path / "qmix-s1", seed=1, learner={"lr": 0.001})
-    with pytest.raises(RunError, match=r"learner\.lr is 0\.0005 in one and 0\.001 in the other"):
-        read_runs(find_runs([tmp_path]))
-    shutil.rmtree(tmp_path / "qmix-s1")
-    shutil.copytree(tmp_path / "qmix-s0", tmp_path / "qmix-s1")
-    with pytest.raises(RunError, match="both 'qmix' on buttons with seed 0"):
-        read_runs(find_runs([tmp_path]))
+    shutil.rmtree(write_run(tmp_path / "qmix-s1", seed=1) / "checkpoints")
+    report([tmp_path], out=tmp_path / "report", episodes=2, crashed=[0])
+    text = (tmp_path / "report" / "table.md").read_text()
+    assert f"{tmp_path / 'qmix-s1'} has no checkpoint yet: left out." in text
+    assert [row["seeds"] for row in results_of(tmp_path / "report")["rows"]] == [[0]]
 
 
 def test_unfinished_runs_and_uneven_lengths_are_named(tmp_path: Path) -> None:
@@ -278,7 +229,7 @@ def test_bad_input(runs: Path, tmp_path: Path) -> None:
         ([], {}, "nothing to report on"),
         ([empty], {}, r"neither a run nor a folder of runs"),
         ([tmp_path / "none"], {}, r"neither a run nor a folder of runs"),
-        ([bare], {}, r"bare-s0 holds no checkpoint"),
+        ([bare], {}, r"none of 1 runs has a checkpoint yet, as .*bare-s0"),
         ([one], {"crashed": [3]}, "--crashed 3: the team has 2 robots"),
         ([one], {"crash_rate": [2.0]}, "--crash-rate 2"),
         ([one], {"mode": "sulk"}, "--mode sulk"),

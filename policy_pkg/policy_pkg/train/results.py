@@ -1,6 +1,6 @@
 """Finished runs: which there are, what distinguishes them, and what is worth keeping of them.
 
-Two runs are two seeds of one method where their settings are equal; the scenario, the seed and the
+Two runs on one map are two seeds of one method where their settings are equal; the seed and the
 length of the run are no settings. What a method is called comes from the folders' names.
 """
 
@@ -70,10 +70,16 @@ def _inside(folder: Path) -> list[Path]:
     return sorted(path.parent for path in folder.glob(f"*/{RUN}"))
 
 
+def has_begun(run: Path) -> bool:
+    """Whether there is a checkpoint of it."""
+    return any((run / CHECKPOINTS).glob("step_*[0-9]"))
+
+
 def read_runs(paths: Iterable[Path]) -> list[Run]:
     """Runs with their methods' names, see ``method_name``.
 
-    Where one name would stand for two settings, the name of the folder above is put before it.
+    Where one name would stand for two settings on one map, the name of the folder above is put
+    before it.
 
     Raises:
         CheckpointError: a run without a checkpoint, or a damaged one.
@@ -141,10 +147,10 @@ def method_name(path: Path, scenario: str, settings: Mapping[str, Any]) -> str:
 
 def _clash(runs: Sequence[Run]) -> str | None:
     """Why these runs' names cannot stand as they are."""
-    settings: dict[str, Run] = {}
+    settings: dict[tuple[str, str], Run] = {}
     seeds: dict[tuple[str, str, int], Run] = {}
     for run in runs:
-        other = settings.setdefault(run.method, run)
+        other = settings.setdefault((run.method, run.scenario), run)
         if other.settings != run.settings:
             before, now = flat(other.settings), flat(run.settings)
             key = min(k for k in {*before, *now} if before.get(k) != now.get(k))
@@ -159,6 +165,19 @@ def _clash(runs: Sequence[Run]) -> str | None:
                 f"seed {run.seed}: give one of them"
             )
     return None
+
+
+def differences(runs: Sequence[Run]) -> list[str]:
+    """What a method was not trained alike in from map to map, a sentence per setting."""
+    found = []
+    for method in dict.fromkeys(run.method for run in runs):
+        maps = {run.scenario: flat(run.settings) for run in runs if run.method == method}
+        for key in sorted({key for settings in maps.values() for key in settings}):
+            values = {name: repr(settings.get(key)) for name, settings in maps.items()}
+            if len(set(values.values())) > 1:
+                where = ", ".join(f"{value} on {name}" for name, value in values.items())
+                found.append(f"Settings differ between the maps: {key} is {where}.")
+    return list(dict.fromkeys(found))
 
 
 def wall_time_s(run: Path) -> float | None:

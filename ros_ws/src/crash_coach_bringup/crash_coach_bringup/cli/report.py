@@ -21,7 +21,15 @@ from crash_coach_bringup.cli.report_page import page
 from policy_pkg.train.evaluate import Condition, crash_free, named
 from policy_pkg.train.kept_evaluations import Evaluations, Result, arena
 from policy_pkg.train.report import Row, exactly_crashed, improvements, rows
-from policy_pkg.train.results import Run, find_runs, last_metrics, read_runs, wall_time_s
+from policy_pkg.train.results import (
+    Run,
+    differences,
+    find_runs,
+    has_begun,
+    last_metrics,
+    read_runs,
+    wall_time_s,
+)
 
 CRASHED = (0, 1, 2)
 RATES = (0.01, 0.05, 0.1)
@@ -94,14 +102,24 @@ def report(
     if not folders:
         raise CliError("nothing to report on: name runs or folders of runs")
     parameters = mode_parameters(mode, param or [])
-    runs = read_runs(find_runs(folders))
+    paths = find_runs(folders)
+    waiting = [path for path in paths if not has_begun(path)]
+    runs = read_runs(path for path in paths if path not in waiting)
+    if not runs:
+        raise CliError(f"none of {len(waiting)} runs has a checkpoint yet, as {waiting[0]}")
     wanted = {
         name: asked(arena(name)[0], crashed, crash_rate, each_robot, mode, parameters)
         for name in dict.fromkeys(run.scenario for run in runs)
     }
     exact = any(exactly_crashed(c) is not None for found in wanted.values() for c in found)
     rates = crash_rate or ([] if crashed or each_robot else RATES)
-    about = {"episodes": episodes, "seed": seed, "mode": mode, "parameters": parameters}
+    about = {
+        "episodes": episodes,
+        "seed": seed,
+        "mode": mode,
+        "parameters": parameters,
+        "without_checkpoint": [str(path) for path in waiting],
+    }
     try:
         out.mkdir(parents=True, exist_ok=True)
         results = _play(runs, wanted, Evaluations(out / "evaluations", episodes, seed))
@@ -135,6 +153,7 @@ def describe(result: Result) -> dict[str, Any]:
         "seed": run.seed,
         "steps": run.steps,
         "total_steps": run.total_steps,
+        "settings": run.settings,
         "gradient_steps": metrics.get("gradient_steps"),
         "new_alpha": metrics.get("new_alpha"),
         "wall_s": wall_time_s(run.path),
@@ -152,7 +171,7 @@ def _write(
     """Tables, JSON and figures; ``run_seed``: whose trajectories are drawn, if any."""
     better = improvements(found)
     described = [describe(result) for result in results]
-    text = page(about, found, described)
+    text = page(about, found, described, differences([each.run for each in results]))
     (out / "table.md").write_text(text, encoding="utf-8")
     content = {
         **about,

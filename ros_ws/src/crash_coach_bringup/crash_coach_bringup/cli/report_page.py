@@ -12,8 +12,14 @@ from policy_pkg.train.statistics import Estimate
 NONE = "–"
 
 
-def page(about: Mapping[str, Any], rows: Sequence[Row], runs: Sequence[Mapping[str, Any]]) -> str:
-    """``about``: episodes, seed, mode; ``runs``: as ``report.describe`` gives them."""
+def page(
+    about: Mapping[str, Any],
+    rows: Sequence[Row],
+    runs: Sequence[Mapping[str, Any]],
+    differences: Sequence[str],
+) -> str:
+    """``about``: episodes, seed, mode, runs without_checkpoint; ``runs``: as ``report.describe``
+    gives them; ``differences``: in training between the maps."""
     mode = about["mode"]
     if about["parameters"]:
         values = ", ".join(f"{name} = {value:g}" for name, value in about["parameters"].items())
@@ -28,7 +34,8 @@ def page(about: Mapping[str, Any], rows: Sequence[Row], runs: Sequence[Mapping[s
         parts.append(_overview(rows, methods))
     parts += ["## Intervals", _meaning(rows), _details(rows)]
     parts += ["## Runs", "Success in %, and after the comma the mean return.", _runs(runs)]
-    parts += [f"- {note}" for note in notes(rows, runs)]
+    waiting = [f"{path} has no checkpoint yet: left out." for path in about["without_checkpoint"]]
+    parts += [f"- {note}" for note in (*waiting, *notes(rows, runs), *differences)]
     return "\n\n".join(parts) + "\n"
 
 
