@@ -11,13 +11,7 @@ from crash_coach_pkg.action_tools import ACTION_OFFERS, UNTOLD, ActionTools
 from crash_coach_pkg.effects import OBSERVED, WITHHELD
 from crash_coach_pkg.faults import fault_mode, is_observation_mode
 from crash_coach_pkg.faults.base import Need
-from crash_coach_pkg.gate_types import (
-    Command,
-    Decision,
-    Outputs,
-    Seen,
-    Sight,
-)
+from crash_coach_pkg.gate_types import Command, Decision, Outputs, Seen, Sight
 from crash_coach_pkg.plan import CrashPlan
 from crash_coach_pkg.plan_book import Event, EventKind, PlanBook, Term, why_not
 from crash_coach_pkg.robot_faults import RobotFaults, Worlds
@@ -54,6 +48,18 @@ class GateState:
         self._lockstep = lockstep
         self._relays = relay_observations
         self.book = PlanBook(lockstep, first_lease_s, self._why_not)
+        self._begin_anew()
+        self.late = [0] * n_robots
+        """Commands dropped because a newer one of the same robot or a newer episode came first."""
+        self.untold = [0] * n_robots
+        """Robot-steps under a fault that needs the worst action, which the policy did not tell."""
+        self.ahead = [0] * n_robots
+        """Commands ignored because the sim can have asked nobody for them yet."""
+        self._last_episode = _UNKNOWN  # that a command may be for
+        self._begun = -1  # the sim's newest episode
+
+    def _begin_anew(self) -> None:
+        n_robots = self._n
         self._commands = [RobotFaults(robot, n_robots, True) for robot in range(n_robots)]
         self._sights = [RobotFaults(robot, n_robots, False) for robot in range(n_robots)]
         self._done: list[tuple[int, int]] = [(-1, -1)] * n_robots
@@ -62,14 +68,7 @@ class GateState:
         self._seen: list[Seen | None] = [None] * n_robots
         self._held_sights: list[Sight | None] = [None] * n_robots
         self._masks: list[tuple[tuple[int, int], BoolArray] | None] = [None] * n_robots
-        self._worlds = Worlds(n_robots, lockstep)
-        self.late = [0] * n_robots
-        """Commands dropped because a newer one of the same robot or a newer episode came first."""
-        self.untold = [0] * n_robots
-        """Robot-steps under a fault that needs the worst action, which the policy did not tell."""
-        self.ahead = [0] * n_robots
-        """Commands ignored because the sim can have asked nobody for them yet."""
-        self._last_episode = _UNKNOWN  # that a command may be for
+        self._worlds = Worlds(n_robots, self._lockstep)
 
     def last(self, robot: int) -> Decision | None:
         """The newest decision on ``robot``."""
@@ -114,10 +113,21 @@ class GateState:
         self._worlds.put(episode, step, world)
         return self._release(now_s)
 
-    def boundary(self, episode: int) -> None:
-        """The sim has begun or ended ``episode``: no command is for one after the next. Otherwise
-        a single wrong number would make every later command late."""
-        self._last_episode = episode + 1
+    def boundary(self, episode: int, begins: bool) -> bool:
+        """The sim has begun or ended ``episode``. Returns whether it was restarted (it begins
+        each episode once, in ascending order): then all that was decided is forgotten.
+
+        In real time no command is for an episode after the next: otherwise a single wrong number
+        would make every later command late."""
+        if not self._lockstep:  # there it is held for a plan that does not come
+            self._last_episode = episode + 1
+        if not begins:
+            return False
+        restarted, self._begun = episode <= self._begun, episode
+        if restarted:
+            self.book.begin_anew(episode)
+            self._begin_anew()
+        return restarted
 
     def command(self, command: Command, now_s: float) -> Outputs:
         """Decides a command, repeats the decision for a duplicate, holds or drops it."""

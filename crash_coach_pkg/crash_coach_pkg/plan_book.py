@@ -214,6 +214,14 @@ class PlanBook:
             self.pending = None
         return True
 
+    def begin_anew(self, episode: int) -> None:
+        """The sim was restarted with ``episode``. The revision and the lease go on: it is the
+        same coach, whose plan counts again where it is for that episode."""
+        self.episode, self.next_step = -1, 0
+        self.terms, self.pending = [], None
+        if self._known and self._accepted is not None and self._accepted.episode == episode:
+            self.pending = Term.of(0, self._accepted)
+
     def at(self, step: int) -> Term | None:
         """What governs ``step`` of the current episode."""
         for term in reversed(self.terms):

@@ -52,15 +52,44 @@ def test_real_time_never_holds() -> None:
 @pytest.mark.parametrize("absurd", [7, 2**32 - 1])
 def test_an_episode_after_the_next_makes_nothing_late(absurd: int) -> None:
     state = gate(lockstep=False)
-    state.boundary(5)
+    assert not state.boundary(5, begins=True)
     assert state.command(command(0, absurd, 3), 0.0) == ()
     assert brief(state.command(command(0, 5, 0), 0.0)) == [(0, 5, 0, "", 3)]
     # The next one: the robot may hear of it before this gate does.
     assert brief(state.command(command(1, 6, 0), 0.0)) == [(1, 6, 0, "", 3)]
     assert (state.ahead, state.late) == ([1, 0], [0, 0])
-    state.boundary(7)  # two more have begun while nothing came from the robots
+    assert not state.boundary(
+        7, begins=False
+    )  # two more have begun while nothing came from the robots
     assert brief(state.command(command(0, 7, 0), 0.0)) == [(0, 7, 0, "", 3)]
     assert state.ahead == [1, 0]
+
+
+@pytest.mark.parametrize("lockstep", [True, False])
+@pytest.mark.parametrize("episode", [0, 4])
+def test_a_restarted_sim_is_followed(lockstep: bool, episode: int) -> None:
+    """Back to an earlier episode, or to the first step of the same one."""
+    state = gate(lockstep)
+    assert not state.boundary(4, begins=True)
+    state.plan(plan(4, 8, MUTE_0), LEASE_S, 0.0)
+    for step in range(3):
+        state.command(command(0, 4, step), 0.0)
+    assert state.command(command(0, 4, 1), 0.0) == ()  # nothing is decided a second time
+    assert not state.boundary(4, begins=False)
+    assert state.boundary(episode, begins=True)
+    if episode != 4:  # the coach follows, and plans for the sim's episode
+        state.plan(plan(episode, 9, MUTE_0), LEASE_S, 0.1)
+    assert brief(state.command(command(0, episode, 0), 0.2)) == [(0, episode, 0, "mute", WITHHELD)]
+    assert brief(state.command(command(1, episode, 0), 0.2)) == [(1, episode, 0, "", 3)]
+    assert brief(state.tick(0.1 + LEASE_S)) == [(EventKind.EXPIRED, episode, 1)]
+
+
+def test_after_a_restart_no_plan_of_another_episode_governs() -> None:
+    state = gate(lockstep=False)
+    state.boundary(4, begins=True)
+    state.plan(plan(5, 8, MUTE_0), LEASE_S, 0.0)
+    assert state.boundary(3, begins=True)
+    assert brief(state.command(command(0, 3, 0), 0.1)) == [(0, 3, 0, "", 3)]
 
 
 def test_next_step_is_the_first_step_that_nothing_was_relayed_of() -> None:

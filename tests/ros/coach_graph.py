@@ -37,8 +37,8 @@ EVENTS = QoSProfile(depth=1000)
 Key = tuple[int, int]
 
 
-def executable(name: str) -> str:
-    return str(Path(get_package_prefix("crash_coach_pkg")) / "lib" / "crash_coach_pkg" / name)
+def executable(name: str, package: str = "crash_coach_pkg") -> str:
+    return str(Path(get_package_prefix(package)) / "lib" / package / name)
 
 
 def arguments(**parameters: object) -> list[str]:
@@ -52,11 +52,11 @@ def arguments(**parameters: object) -> list[str]:
 
 @contextmanager
 def process(
-    env: dict[str, str], name: str, **parameters: object
+    env: dict[str, str], name: str, package: str = "crash_coach_pkg", **parameters: object
 ) -> Iterator[subprocess.Popen[str]]:
-    """An executable of the package in a session of its own, gone when the block is left."""
+    """An executable in a session of its own, gone when the block is left."""
     child = subprocess.Popen(
-        [executable(name), *arguments(**parameters)],
+        [executable(name, package), *arguments(**parameters)],
         env=env,
         text=True,
         stderr=subprocess.PIPE,

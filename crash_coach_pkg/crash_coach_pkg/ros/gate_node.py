@@ -68,8 +68,8 @@ class ActionGate:
         self._commands = [
             base.command_publisher(robot, Action, NEWEST).publish for robot in range(len(robots))
         ]
+        base.create_subscription(EpisodeState, "/sim/boundary", self._on_boundary, EPISODE)
         if not lockstep:  # there the sim waits, and says loudly what it does not get
-            base.create_subscription(EpisodeState, "/sim/boundary", self._on_boundary, EPISODE)
             base.create_subscription(
                 Clock, "/clock", self._on_clock, QoSProfile(depth=10), raw=True
             )
@@ -159,7 +159,11 @@ class ActionGate:
         self._send(self._state.command(command, now_s))
 
     def _on_boundary(self, message: EpisodeState) -> None:
-        self._state.boundary(message.episode)
+        begins = message.step == 0 and not (message.terminated or message.truncated)
+        if self._state.boundary(message.episode, begins):
+            self._base.get_logger().warning(
+                f"the sim was restarted: it begins episode {message.episode} (again)"
+            )
 
     def _on_clock(self, _: bytes) -> None:
         self._base.health.sim_moved(time.monotonic())
