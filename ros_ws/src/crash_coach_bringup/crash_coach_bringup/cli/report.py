@@ -102,11 +102,7 @@ def report(
     if not folders:
         raise CliError("nothing to report on: name runs or folders of runs")
     parameters = mode_parameters(mode, param or [])
-    paths = find_runs(folders)
-    waiting = [path for path in paths if not has_begun(path)]
-    runs = read_runs(path for path in paths if path not in waiting)
-    if not runs:
-        raise CliError(f"none of {len(waiting)} runs has a checkpoint yet, as {waiting[0]}")
+    runs, waiting = _begun(find_runs(folders))
     wanted = {
         name: asked(arena(name)[0], crashed, crash_rate, each_robot, mode, parameters)
         for name in dict.fromkeys(run.scenario for run in runs)
@@ -127,6 +123,15 @@ def report(
         _write(out, about, found, results, trajectories)
     except OSError as error:
         raise CliError(f"--out {out}: {error.strerror}: {error.filename}") from error
+
+
+def _begun(paths: Sequence[Path]) -> tuple[list[Run], list[Path]]:
+    """The runs, and those that have no checkpoint yet."""
+    waiting = [path for path in paths if not has_begun(path)]
+    runs = read_runs(path for path in paths if path not in waiting)
+    if not runs:
+        raise CliError(f"none of {len(waiting)} runs has a checkpoint yet, as {waiting[0]}")
+    return runs, waiting
 
 
 def _play(
