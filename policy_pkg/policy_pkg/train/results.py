@@ -17,7 +17,14 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from policy_pkg.checkpoint import AGENT, CHECKPOINTS, MANIFEST, find_checkpoint, read_manifest
+from policy_pkg.checkpoint import (
+    AGENT,
+    CHECKPOINTS,
+    MANIFEST,
+    find_checkpoint,
+    list_checkpoints,
+    read_manifest,
+)
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.offline_config import OfflineConfig
 from policy_pkg.train.run_dir import METRICS, RUN, TIMING, RunError, flat, read_run, seedless_name
@@ -72,7 +79,7 @@ def _inside(folder: Path) -> list[Path]:
 
 def has_begun(run: Path) -> bool:
     """Whether there is a checkpoint of it."""
-    return any((run / CHECKPOINTS).glob("step_*[0-9]"))
+    return bool(list_checkpoints(run / CHECKPOINTS))
 
 
 def read_runs(paths: Iterable[Path]) -> list[Run]:
@@ -251,15 +258,16 @@ def collect(run: Path, results: Path) -> str | None:
         OSError: it could not be written.
     """
     wanted = _wanted(read_run(run)["config"])
-    last = max((run / CHECKPOINTS).glob("step_*[0-9]"), default=None)
-    if last is None or _steps(last) < wanted:
-        done = 0 if last is None else _steps(last)
+    made = list_checkpoints(run / CHECKPOINTS)
+    done = _steps(made[-1]) if made else 0
+    if done < wanted:
         return f"{run}: not finished: checkpoint at {done:,} of {wanted:,} steps"
     kept = results / run.name
     if kept.resolve() == run.resolve() or (kept.exists() and not (kept / RUN).is_file()):
         raise RunError(f"{kept} is not a copy of {run}: choose another folder for the results")
     partial = results / f"{run.name}.partial"
     shutil.rmtree(partial, ignore_errors=True)
+    last = made[-1]
     agent = partial / CHECKPOINTS / last.name
     agent.mkdir(parents=True)
     for name in AGENT_FILES:
