@@ -72,11 +72,11 @@ def test_a_panel_per_map_with_every_seed_and_their_mean(tmp_path: Path) -> None:
     rows = [block(k, 0.1 * k) for k in range(5)]
     runs = [run(tmp_path / f"buttons-s{seed}", rows, seed=seed) for seed in range(3)]
     runs.append(run(tmp_path / "3m-s0", rows, "skirmish/3m"))
-    figure = learning_curves(runs)
+    figure = learning_curves(runs, ["qmix"])
     assert figure is not None
     assert [ax.get_title() for ax in figure.axes] == ["buttons", "skirmish/3m"]
     assert [len(ax.get_lines()) for ax in figure.axes] == [3 + 1, 1]
-    assert learning_curves([run(tmp_path / "none", [])]) is None
+    assert learning_curves([run(tmp_path / "none", [])], ["qmix"]) is None
 
 
 def test_damaged_metrics_are_named(tmp_path: Path) -> None:

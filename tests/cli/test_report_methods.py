@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
 import pytest
 from report_cases import write_run
 
+from crash_coach_bringup.cli.plot import style
 from crash_coach_bringup.cli.report import report
+from crash_coach_bringup.cli.report_curves import learning_curves
+from crash_coach_bringup.cli.report_figures import resilience
+from policy_pkg.train.evaluate import exactly
+from policy_pkg.train.kept_evaluations import Evaluations
+from policy_pkg.train.report import rows
 from policy_pkg.train.results import find_runs, method_name, read_runs
 from policy_pkg.train.run_dir import RunError
 
@@ -57,3 +64,38 @@ def test_a_method_may_have_other_settings_on_another_map(tmp_path: Path) -> None
     text = (tmp_path / "report" / "table.md").read_text()
     assert "the maps: batch_episodes is 32 on buttons, 16 on buttons_8." in text
     assert text.count("Settings differ") == 1
+
+
+def test_methods_keep_the_order_they_are_given_in_and_their_colours(tmp_path: Path) -> None:
+    """Also where the first map lacks a method that is listed before one of its own."""
+    given = [
+        ("buttons", "vdn"),
+        ("buttons_8", "central"),
+        ("buttons", "qmix"),
+        ("buttons_8", "vdn"),
+    ]
+    runs = []
+    for scenario, name in given:
+        run = write_run(tmp_path / scenario / f"{name}-s0", scenario)
+        lines = [{"env_steps": k, "success_crash_free": 0.5} for k in (0, 200)]
+        (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+        runs.append(run)
+    found = read_runs(runs)
+    conditions = [exactly(k) for k in (0, 1)]
+    kept = Evaluations(tmp_path / "evaluations", 2, 0)
+    results = [kept.result(run, conditions, lambda condition: None) for run in found]
+    places = [(row.scenario, row.method) for row in rows(results, []) if row.crashed == 0]
+    assert places == [
+        ("buttons", "vdn"), ("buttons", "qmix"), ("buttons_8", "vdn"), ("buttons_8", "central"),
+    ]  # fmt: skip
+    methods = ["vdn", "central", "qmix"]
+    measured = resilience(rows(results, []), methods)
+    learned = learning_curves(found, methods)
+    assert learned is not None
+    for figure in (measured, learned):
+        (legend,) = figure.legends
+        drawn = [(handle.get_label(), handle.get_color()) for handle in legend.get_lines()]
+        assert drawn == [(name, style(place)[0]) for place, name in enumerate(methods)]
+        lines = [line for line in figure.axes[0].get_lines() if len(line.get_xdata())]
+        colours = {line.get_color() for line in lines}
+        assert colours == {style(0)[0], style(2)[0]}

@@ -86,11 +86,17 @@ def rows(results: Sequence[Result], rates: Sequence[float]) -> list[Row]:
     """A row per map, condition and method; then those over all maps, where there are several.
 
     Args:
-        results: of all runs, with the same conditions on the same map.
+        results: of all runs, with the same conditions on the same map; their order is that of
+            maps and methods, here and in the figures.
         rates: crash rates to be estimated from the results for exact numbers of crashed robots.
     """
     groups: dict[str, dict[str, list[Result]]] = {}  # map -> method -> results
-    for result in sorted(results, key=lambda r: (r.run.scenario, r.run.method, r.run.seed)):
+    maps = list(dict.fromkeys(result.run.scenario for result in results))
+    names = list(dict.fromkeys(result.run.method for result in results))
+    for result in sorted(
+        results,
+        key=lambda r: (maps.index(r.run.scenario), names.index(r.run.method), r.run.seed),
+    ):
         methods = groups.setdefault(result.run.scenario, {})
         methods.setdefault(result.run.method, []).append(result)
     found: list[Row] = []

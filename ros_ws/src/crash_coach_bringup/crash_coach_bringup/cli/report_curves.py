@@ -64,13 +64,16 @@ def mean_curve(curves: Sequence[Curve]) -> tuple[Floats, Floats]:
     return grid, np.mean(rows, axis=0)
 
 
-def learning_curves(runs: Sequence[Run]) -> Figure | None:
-    """Thin lines are seeds, a thick one is their mean; None where no run kept its blocks."""
+def learning_curves(runs: Sequence[Run], methods: Sequence[str]) -> Figure | None:
+    """Thin lines are seeds, a thick one is their mean; None where no run kept its blocks.
+
+    Args:
+        methods: all there are, in the order of their colours.
+    """
     curves = [curve for run in runs if (curve := read_curve(run)) is not None]
     if not curves:
         return None
     maps = list(dict.fromkeys(curve.run.scenario for curve in curves))
-    methods = list(dict.fromkeys(run.method for run in runs))
     figure, axes = panels(len(maps), width=3.6, height=3.0)
     for ax, name in zip(axes, maps, strict=True):
         mine = [curve for curve in curves if curve.run.scenario == name]
@@ -85,7 +88,7 @@ def learning_curves(runs: Sequence[Run]) -> Figure | None:
         Line2D([], [], color=style(i)[0], linestyle=style(i)[1], label=name)
         for i, name in enumerate(methods)
     ]
-    legend_above(figure, handles, methods)
+    legend_above(figure, handles)
     text = f"running mean of {BLOCKS} evaluation blocks; thin: seeds, thick: their mean"
     figure.supxlabel(f"{text}, as far as all reach", fontsize=8, color=INK)
     return figure

@@ -33,12 +33,14 @@ def write(
         CliError: a file cannot be written.
     """
     exact = [row for row in rows if row.crashed is not None and row.scenario != ALL_MAPS]
+    # One order, and so one colour per method, in all figures.
+    methods = list(dict.fromkeys(run.method for run in runs))
     figures: dict[str, Figure] = {}
     if len({row.crashed for row in exact}) > 1:
-        figures["resilience"] = resilience(exact)
+        figures["resilience"] = resilience(exact, methods)
     if exact:
         figures["success"] = success(exact, in_recordings(runs))
-    if (curves := learning_curves(runs)) is not None:
+    if (curves := learning_curves(runs, methods)) is not None:
         figures["curves"] = curves
     if better:
         figures["improvement"] = improvement(better)
@@ -50,13 +52,15 @@ def write(
     return files
 
 
-def resilience(rows: Sequence[Row]) -> Figure:
+def resilience(rows: Sequence[Row], methods: Sequence[str]) -> Figure:
     """A panel per map: each method's mean, and the runs it comes from.
 
     A single seed has Wilson's interval over its episodes instead.
+
+    Args:
+        methods: all there are, in the order of their colours.
     """
     maps = list(dict.fromkeys(row.scenario for row in rows))
-    methods = list(dict.fromkeys(row.method for row in rows))
     figure, axes = panels(len(maps), width=3.4, height=3.2)
     for ax, name in zip(axes, maps, strict=True):
         for index, method in enumerate(methods):
@@ -71,7 +75,7 @@ def resilience(rows: Sequence[Row]) -> Figure:
         Line2D([], [], color=style(i)[0], linestyle=style(i)[1], marker="o", label=name)
         for i, name in enumerate(methods)
     ]
-    legend_above(figure, handles, methods)
+    legend_above(figure, handles)
     marks = {"large: mean of the seeds, small: each seed": any(len(r.seeds) > 1 for r in rows)}
     marks["bar: Wilson's 95 % interval of a single seed"] = any(len(r.seeds) == 1 for r in rows)
     text = "; ".join(text for text, there in marks.items() if there)
@@ -129,12 +133,14 @@ def trajectories(results: Sequence[Result], run_seed: int, seed: int, out: Path)
     if len(maps) != 1:
         found = ", ".join(sorted(maps)) or "no run"
         raise CliError(f"--trajectories {run_seed}: runs of that seed on one map; found: {found}")
+    methods = list(dict.fromkeys(result.run.method for result in results))
     teams = []
-    for index, result in enumerate(chosen):
+    for result in chosen:
         bundle = load_policy(result.run.path)
         scenario = result.run.scenario
         first = [(c, evaluate(bundle, scenario, c, 1, seed)) for c, _ in result.outcomes]
-        teams.append(TeamResults(result.run.method, style(index)[0], bundle, first))
+        colour, _ = style(methods.index(result.run.method))
+        teams.append(TeamResults(result.run.method, colour, bundle, first))
     path = out / "trajectories.png"
     draw_first_episodes(teams, maps.pop(), path)
     return path

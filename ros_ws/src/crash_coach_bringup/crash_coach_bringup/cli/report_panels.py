@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 COLUMNS = 4
-LEGEND_LINE = 0.2  # inches
 
 
 def panels(count: int, width: float, height: float) -> tuple[Figure, list[Any]]:
@@ -28,8 +27,14 @@ def panels(count: int, width: float, height: float) -> tuple[Figure, list[Any]]:
     return figure, axes[:count]
 
 
-def legend_above(figure: Figure, handles: Sequence[Line2D], names: Sequence[str]) -> None:
-    """In as many columns as the longest name allows; the figure grows by the legend's height."""
-    columns = max(1, int(figure.get_figwidth() / (1.0 + 0.085 * max(map(len, names)))))
-    figure.set_figheight(figure.get_figheight() + LEGEND_LINE * math.ceil(len(names) / columns))
-    figure.legend(handles=handles, loc="outside upper center", ncols=columns, frameon=False)
+def legend_above(figure: Figure, handles: Sequence[Line2D]) -> None:
+    """In as many columns as fit; the figure grows by the legend's height."""
+    for columns in range(len(handles), 0, -1):
+        legend = figure.legend(
+            handles=handles, loc="outside upper center", ncols=columns, frameon=False, fontsize=8
+        )
+        box = legend.get_window_extent()
+        if columns == 1 or box.width <= figure.bbox.width:
+            break
+        legend.remove()
+    figure.set_figheight(figure.get_figheight() + box.height / figure.dpi)

@@ -39,17 +39,15 @@ def success(rows: Sequence[Row], recorded: Mapping[MapMethod, float]) -> Figure:
     for ax, name in zip(axes, maps, strict=True):
         _draw_map(ax, [row for row in rows if row.scenario == name], conditions, recorded)
         ax.set_title(name, fontsize=11, color=INK)
-    labels = list(conditions)
     handles = [
         Line2D([], [], color=COLOURS[i % len(COLOURS)], marker="o", linestyle="", label=condition)
         for i, condition in enumerate(conditions)
     ]
     if recorded:
-        labels.append(DATA)
         handles.append(
             Line2D([], [], color=INK, marker="|", markersize=14, linestyle="", label=DATA)
         )
-    legend_above(figure, handles, labels)
+    legend_above(figure, handles)
     text = "success rate; large: mean of the seeds, small: each seed; bar: 95 % interval"
     figure.supxlabel(text, fontsize=8, color=INK)
     return figure
