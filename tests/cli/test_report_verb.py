@@ -67,7 +67,16 @@ def test_report_of_two_methods(
     }  # fmt: skip
     assert found["runs"][0]["wall_s"] == 80.0
     text = (out / "table.md").read_text()
-    assert "| map | condition | qmix | vdn |" in text
+    overview = text.split("### buttons\n")[1].splitlines()
+    assert overview[1] == "| method | crash-free | 1 crashed | rate 0.1 | rate 0.1, re-weighted |"
+    cells = [line.strip("| ").split(" | ") for line in overview[3:5]]
+    assert [line[0] for line in cells] == ["qmix", "vdn"]
+    means = [sum(row["success"]) / 3 for row in found["rows"]]
+    for place, mean in enumerate(means):
+        condition, method = divmod(place, 2)
+        assert cells[method][1 + condition].strip("*").startswith(f"{100 * mean:.1f} ± ")
+        is_best = mean == max(means[2 * condition : 2 * condition + 2])
+        assert cells[method][1 + condition].startswith("**") == is_best
     assert "not measured (probability 1.0 %) count as failures" in text
     assert text in capsys.readouterr().out
 

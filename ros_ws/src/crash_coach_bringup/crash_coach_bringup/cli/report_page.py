@@ -24,14 +24,13 @@ def page(
     if about["parameters"]:
         values = ", ".join(f"{name} = {value:g}" for name, value in about["parameters"].items())
         mode += f" ({values})"
-    methods = list(dict.fromkeys(row.method for row in rows))
     parts = [
         f"Success in % of {about['episodes']} greedy episodes per run and condition (evaluation "
         f"seed {about['seed']}, the same episodes for every run; crashed robots: {mode}).",
     ]
-    if len(methods) > 1:
+    if len({row.method for row in rows}) > 1:
         parts += ["## Methods", "Mean ± sample standard deviation over seeds; best in bold."]
-        parts.append(_overview(rows, methods))
+        parts += _overview(rows)
     parts += ["## Intervals", _meaning(rows), _details(rows)]
     parts += ["## Runs", "Success in %, and after the comma the mean return.", _runs(runs)]
     waiting = [f"{path} has no checkpoint yet: left out." for path in about["without_checkpoint"]]
@@ -53,17 +52,21 @@ def span(estimate: Estimate | None) -> str:
     return NONE if estimate is None else f"{figure(estimate.low)}..{figure(estimate.high)}"
 
 
-def _overview(rows: Sequence[Row], methods: Sequence[str]) -> str:
-    """Conditions down, methods across."""
+def _overview(rows: Sequence[Row]) -> list[str]:
+    """As the paper has it: a table per map, methods down, conditions across."""
     bold = best(rows)
-    cells: dict[tuple[str, str], dict[str, str]] = {}
+    maps: dict[str, dict[str, dict[str, str]]] = {}  # map -> method -> condition -> cell
     for row in rows:
         text = percent(row)
         if (row.scenario, row.condition, row.method) in bold:
             text = f"**{text}**"
-        cells.setdefault((row.scenario, row.condition), {})[row.method] = text
-    lines = [[*key, *(by.get(name, NONE) for name in methods)] for key, by in cells.items()]
-    return table(["map", "condition", *methods], lines)
+        maps.setdefault(row.scenario, {}).setdefault(row.method, {})[row.condition] = text
+    out = []
+    for name, methods in maps.items():
+        conditions = list(dict.fromkeys(row.condition for row in rows if row.scenario == name))
+        lines = [[m, *(cells.get(c, NONE) for c in conditions)] for m, cells in methods.items()]
+        out += [f"### {name}", table(["method", *conditions], lines)]
+    return out
 
 
 def _meaning(rows: Sequence[Row]) -> str:
