@@ -28,13 +28,17 @@ def panels(count: int, width: float, height: float) -> tuple[Figure, list[Any]]:
 
 
 def legend_above(figure: Figure, handles: Sequence[Line2D]) -> None:
-    """In as many columns as fit; the figure grows by the legend's height."""
-    for columns in range(len(handles), 0, -1):
+    """In as few lines as fit; the figure grows by the legend's height."""
+    for lines in range(1, len(handles) + 1):
         legend = figure.legend(
-            handles=handles, loc="outside upper center", ncols=columns, frameon=False, fontsize=8
+            handles=handles,
+            loc="outside upper center",
+            ncols=math.ceil(len(handles) / lines),
+            frameon=False,
+            fontsize=8,
         )
         box = legend.get_window_extent()
-        if columns == 1 or box.width <= figure.bbox.width:
+        if lines == len(handles) or box.width <= figure.bbox.width:
             break
         legend.remove()
     figure.set_figheight(figure.get_figheight() + box.height / figure.dpi)
