@@ -81,6 +81,32 @@ def test_report_of_two_methods(
     assert text in capsys.readouterr().out
 
 
+def test_differences_of_runs_with_the_same_seed(tmp_path: Path) -> None:
+    for seed in range(2):
+        write_run(tmp_path / f"qmix-s{seed}", seed=seed)
+        write_run(tmp_path / f"vdn-s{seed}", seed=seed, learner={"algorithm": "vdn"})
+    asked = {"episodes": 16, "crashed": [0], "crash_rate": [0.5]}
+    report([tmp_path], out=tmp_path / "report", against=["qmix"], **asked)
+    found = results_of(tmp_path / "report")
+    conditions = ("crash-free", "rate 0.5", "rate 0.5, re-weighted")
+    differences = found["paired_differences"]
+    assert [each["condition"] for each in differences] == list(conditions)
+    text = (tmp_path / "report" / "table.md").read_text()
+    section = text.split("## Differences\n")[1].split("\n## Intervals")[0]
+    for place, (condition, each) in enumerate(zip(conditions, differences, strict=True)):
+        qmix, vdn = found["rows"][2 * place]["success"], found["rows"][2 * place + 1]["success"]
+        assert each["values"] == pytest.approx([b - a for a, b in zip(qmix, vdn, strict=True)])
+        mean = f"{50 * (sum(vdn) - sum(qmix)):+.1f}".replace("-", "−")
+        table = section.split(f"### {condition}\n")[1].strip().splitlines()
+        assert table[0] == "| difference | buttons |"
+        assert table[2].startswith(f"| vdn − qmix | {mean} ± ")
+    shutil.rmtree(tmp_path / "vdn-s1")
+    report([tmp_path], out=tmp_path / "report", against=["qmix"], **asked)
+    assert "None: no two methods have 2 seeds" in (tmp_path / "report" / "table.md").read_text()
+    with pytest.raises(CliError, match="--against iql: no such method; there are qmix, vdn"):
+        report([tmp_path], out=tmp_path / "report", against=["qmix", "iql"], **asked)
+
+
 def test_it_goes_on_where_it_was_left_and_repeats_every_digit(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -20,6 +20,7 @@ from crash_coach_bringup.cli.output import CliError, console, write_json
 from crash_coach_bringup.cli.report_page import page
 from policy_pkg.train.evaluate import Condition, crash_free, named
 from policy_pkg.train.kept_evaluations import Evaluations, Result, arena
+from policy_pkg.train.paired import paired_differences
 from policy_pkg.train.report import Row, exactly_crashed, improvements, rows
 from policy_pkg.train.results import (
     Run,
@@ -69,9 +70,16 @@ RateOption = Annotated[
         "its results. [default: 0.01 0.05 0.1, or none where another crash option is given]"
     ),
 ]
+EachRobotOption = Annotated[
+    bool, typer.Option("--each-robot", help="Also each robot alone, in every episode.")
+]
 TrajectoriesOption = Annotated[
     int | None,
     typer.Option(help="SEED: draw the first episode of every method's run with that seed."),
+]
+AgainstOption = Annotated[
+    list[str] | None,
+    typer.Option(help="METHOD ...: also the differences of all others to these, paired by seed."),
 ]
 
 
@@ -87,12 +95,11 @@ def report(
     ] = 128,
     crashed: CrashedOption = None,
     crash_rate: RateOption = None,
-    each_robot: Annotated[
-        bool, typer.Option("--each-robot", help="Also each robot alone, in every episode.")
-    ] = False,
+    each_robot: EachRobotOption = False,
     mode: ModeOption = "mute",
     param: ParamOption = None,
     seed: Annotated[int, typer.Option(help="Of the episodes, the same for every run.", min=0)] = 0,
+    against: AgainstOption = None,
     trajectories: TrajectoriesOption = None,
 ) -> None:
     """Compares methods over seeds: evaluates many runs alike.
@@ -103,6 +110,7 @@ def report(
         raise CliError("nothing to report on: name runs or folders of runs")
     parameters = mode_parameters(mode, param or [])
     runs, waiting = _begun(find_runs(folders))
+    _check_methods(against or [], runs)
     wanted = {
         name: asked(arena(name)[0], crashed, crash_rate, each_robot, mode, parameters)
         for name in dict.fromkeys(run.scenario for run in runs)
@@ -114,6 +122,7 @@ def report(
         "seed": seed,
         "mode": mode,
         "parameters": parameters,
+        "against": against or [],
         "without_checkpoint": [str(path) for path in waiting],
     }
     try:
@@ -132,6 +141,13 @@ def _begun(paths: Sequence[Path]) -> tuple[list[Run], list[Path]]:
     if not runs:
         raise CliError(f"none of {len(waiting)} runs has a checkpoint yet, as {waiting[0]}")
     return runs, waiting
+
+
+def _check_methods(against: Sequence[str], runs: Sequence[Run]) -> None:
+    methods = list(dict.fromkeys(run.method for run in runs))
+    for name in against:
+        if name not in methods:
+            raise CliError(f"--against {name}: no such method; there are {', '.join(methods)}")
 
 
 def _play(
@@ -176,11 +192,13 @@ def _write(
     """Tables, JSON and figures; ``run_seed``: whose trajectories are drawn, if any."""
     better = improvements(found)
     described = [describe(result) for result in results]
-    text = page(about, found, described, differences([each.run for each in results]))
+    paired = paired_differences(found, about["against"])
+    text = page(about, found, paired, described, differences([each.run for each in results]))
     (out / "table.md").write_text(text, encoding="utf-8")
     content = {
         **about,
         "rows": [asdict(row) for row in found],
+        "paired_differences": [asdict(each) for each in paired],
         "improvements": [asdict(each) for each in better],
         "runs": described,
     }

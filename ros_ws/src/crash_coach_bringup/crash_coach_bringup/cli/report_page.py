@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from crash_coach_bringup.cli.markdown import table
+from policy_pkg.train.paired import LEAST_PAIRS, PairedDifference
 from policy_pkg.train.report import ALL_MAPS, Row, best
 from policy_pkg.train.statistics import Estimate
 
@@ -15,11 +16,12 @@ NONE = "–"
 def page(
     about: Mapping[str, Any],
     rows: Sequence[Row],
+    paired: Sequence[PairedDifference],
     runs: Sequence[Mapping[str, Any]],
     differences: Sequence[str],
 ) -> str:
-    """``about``: episodes, seed, mode, runs without_checkpoint; ``runs``: as ``report.describe``
-    gives them; ``differences``: in training between the maps."""
+    """``about``: episodes, seed, mode, against, runs without_checkpoint; ``runs``: as
+    ``report.describe`` gives them; ``differences``: in training between the maps."""
     mode = about["mode"]
     if about["parameters"]:
         values = ", ".join(f"{name} = {value:g}" for name, value in about["parameters"].items())
@@ -31,6 +33,8 @@ def page(
     if len({row.method for row in rows}) > 1:
         parts += ["## Methods", "Mean ± sample standard deviation over seeds; best in bold."]
         parts += _overview(rows)
+    if about["against"]:
+        parts += ["## Differences", *_differences(paired)]
     parts += ["## Intervals", _meaning(rows), _details(rows)]
     parts += ["## Runs", "Success in %, and after the comma the mean return.", _runs(runs)]
     waiting = [f"{path} has no checkpoint yet: left out." for path in about["without_checkpoint"]]
@@ -66,6 +70,27 @@ def _overview(rows: Sequence[Row]) -> list[str]:
         conditions = list(dict.fromkeys(row.condition for row in rows if row.scenario == name))
         lines = [[m, *(cells.get(c, NONE) for c in conditions)] for m, cells in methods.items()]
         out += [f"### {name}", table(["method", *conditions], lines)]
+    return out
+
+
+def _differences(paired: Sequence[PairedDifference]) -> list[str]:
+    """A table per condition, pairs of methods down, maps across."""
+    if not paired:
+        return [f"None: no two methods have {LEAST_PAIRS} seeds in common on a map."]
+    maps = list(dict.fromkeys(each.scenario for each in paired))
+    out = [
+        "In percentage points, of runs with the same seed: mean and Student's t interval (95 %), "
+        "without a correction for how many there are."
+    ]
+    for condition in dict.fromkeys(each.condition for each in paired):
+        lines: dict[str, dict[str, str]] = {}
+        for each in paired:
+            if each.condition == condition:
+                middle, half = each.interval.value, each.interval.high - each.interval.value
+                text = f"{round(100 * middle, 9):+.1f} ± {figure(half)}".replace("-", "−")
+                lines.setdefault(f"{each.method} − {each.against}", {})[each.scenario] = text
+        cells = [[pair, *(of.get(name, NONE) for name in maps)] for pair, of in lines.items()]
+        out += [f"### {condition}", table(["difference", *maps], cells)]
     return out
 
 
