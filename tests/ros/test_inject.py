@@ -113,21 +113,16 @@ def test_a_part_of_each_episode(graph: Graph) -> None:
             assert tuple(state.crashed) == ((1, 1) if 2 <= state.step - 1 < 5 else (0, 0))
 
 
-@pytest.mark.parametrize(
-    ("victims", "mode", "apply_at", "duration", "reason"),
-    [
+def test_what_is_wrong_is_refused_whole(graph: Graph) -> None:
+    for victims, mode, apply_at, duration, reason in (
         (("robot_9",), "mute", "next_step", 0, "unknown robot 'robot_9'.*robot_1, robot_2"),
         (("robot_1", "robot_1"), "mute", "next_step", 0, "robot_1 more than once"),
         (("robot_1",), "mute", "now", 0, "apply_at 'now'.*'next_step'"),
         (("robot_1",), "mute", "next_step", -1, "duration_steps"),
-    ],
-)
-def test_what_is_wrong_is_refused_whole(
-    graph: Graph, victims: tuple[str, ...], mode: str, apply_at: str, duration: int, reason: str
-) -> None:
-    with pytest.raises(InjectError, match=f"the coach refused: .*{reason}"):
-        inject(victims, mode, apply_at, duration, domain=graph.domain)
-    assert crashed(graph.episodes(1)) == {(0, 0)}
+    ):
+        with pytest.raises(InjectError, match=f"the coach refused: .*{reason}"):
+            inject(victims, mode, apply_at, duration, domain=graph.domain)
+        assert crashed(graph.episodes(1)) == {(0, 0)}
 
 
 def test_a_mode_with_parameters_instead_of_what_was_set_before(graph: Graph) -> None:
