@@ -41,7 +41,7 @@ class Graph:
 
 
 @pytest.fixture(scope="module")
-def graph(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Graph]:
+def untouched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Graph]:
     folder = tmp_path_factory.mktemp("graph")
     checkpoint = folder / "step_0"
     write_untrained(checkpoint, make_env("buttons", 1).spec, seed=1)
@@ -60,11 +60,12 @@ def graph(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Graph]:
             yield Graph(client, domain)
 
 
-@pytest.fixture(autouse=True)
-def no_fault(graph: Graph) -> Iterator[None]:
-    graph.episodes(1)
-    yield
-    clear(domain=graph.domain)
+@pytest.fixture
+def graph(untouched: Graph) -> Iterator[Graph]:
+    """For tests that inject something."""
+    yield untouched
+    clear(domain=untouched.domain)
+    assert crashed(untouched.episodes(1)) == {(0, 0)}
 
 
 def crashed(states: list[EpisodeState]) -> set[tuple[int, ...]]:
@@ -113,7 +114,7 @@ def test_a_part_of_each_episode(graph: Graph) -> None:
             assert tuple(state.crashed) == ((1, 1) if 2 <= state.step - 1 < 5 else (0, 0))
 
 
-def test_what_is_wrong_is_refused_whole(graph: Graph) -> None:
+def test_what_is_wrong_is_refused_whole(untouched: Graph) -> None:
     for victims, mode, apply_at, duration, reason in (
         (("robot_9",), "mute", "next_step", 0, "unknown robot 'robot_9'.*robot_1, robot_2"),
         (("robot_1", "robot_1"), "mute", "next_step", 0, "robot_1 more than once"),
@@ -121,8 +122,8 @@ def test_what_is_wrong_is_refused_whole(graph: Graph) -> None:
         (("robot_1",), "mute", "next_step", -1, "duration_steps"),
     ):
         with pytest.raises(InjectError, match=f"the coach refused: .*{reason}"):
-            inject(victims, mode, apply_at, duration, domain=graph.domain)
-        assert crashed(graph.episodes(1)) == {(0, 0)}
+            inject(victims, mode, apply_at, duration, domain=untouched.domain)
+        assert crashed(untouched.episodes(1)) == {(0, 0)}
 
 
 def test_a_mode_with_parameters_instead_of_what_was_set_before(graph: Graph) -> None:
@@ -153,22 +154,22 @@ def test_a_mode_with_parameters_instead_of_what_was_set_before(graph: Graph) -> 
     assert all(applied in (intent, -1) for applied, intent in pairs)
 
 
-def test_unknown_modes_and_parameters_are_named(graph: Graph) -> None:
+def test_unknown_modes_and_parameters_are_named() -> None:
     with pytest.raises(UserError, match=r"unknown crash mode 'explode'; one of: mute, random"):
-        inject(("robot_1",), "explode", domain=graph.domain)
+        inject(("robot_1",), "explode")
     with pytest.raises(UserError, match=r"crash mode delay: parameter stps .*steps"):
-        inject(("robot_1",), "delay", domain=graph.domain, parameters={"stps": 1})
+        inject(("robot_1",), "delay", parameters={"stps": 1})
 
 
-def test_what_the_gate_cannot_do_is_refused_with_its_reason(graph: Graph) -> None:
+def test_what_the_gate_cannot_do_is_refused_with_its_reason(untouched: Graph) -> None:
     with pytest.raises(InjectError, match=r"the coach refused: the gate refused: .*observations"):
-        inject(("robot_1",), "blind", domain=graph.domain)
-    assert crashed(graph.episodes(1)) == {(0, 0)}
+        inject(("robot_1",), "blind", domain=untouched.domain)
+    assert crashed(untouched.episodes(1)) == {(0, 0)}
 
 
-def test_nobody_is_not_a_victim(graph: Graph) -> None:
+def test_nobody_is_not_a_victim() -> None:
     with pytest.raises(InjectError, match="name at least one robot"):
-        inject((), "mute", domain=graph.domain)
+        inject((), "mute")
 
 
 def test_a_domain_without_a_coach_is_named(ros_env: dict[str, str], tmp_path: Path) -> None:
