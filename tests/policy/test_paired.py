@@ -1,11 +1,11 @@
-"""Differences between methods, paired by seed."""
+"""Differences between methods, paired by seed; which one is the best."""
 
 from __future__ import annotations
 
 import pytest
 
 from policy_pkg.train.paired import PairedDifference, paired_differences
-from policy_pkg.train.report import ALL_MAPS, Row
+from policy_pkg.train.report import ALL_MAPS, Row, best
 
 
 def row(
@@ -67,3 +67,15 @@ def test_conditions_are_kept_apart() -> None:
     found = paired_differences(rows, ["qmix"])
     assert [each.condition for each in found] == ["crash-free", "1 crashed"]
     assert [each.interval.value for each in found] == pytest.approx([-0.1, 0.5])
+
+
+def test_the_best_are_named_where_there_is_a_difference() -> None:
+    rows = [
+        row("3m", "qmix", {0: 0.5, 1: 0.7}),
+        row("3m", "fix", {0: 0.7, 1: 0.5}),
+        row("3m", "poor", {0: 0.5, 1: 0.5}),
+        row("8m", "qmix", {0: 0.0, 1: 0.0}),
+        row("8m", "fix", {0: 0.0, 1: 0.0}),
+        row("2m", "qmix", {0: 1.0, 1: 1.0}),
+    ]
+    assert best(rows) == {("3m", "crash-free", "qmix"), ("3m", "crash-free", "fix")}

@@ -227,13 +227,14 @@ def improvements(found: Sequence[Row]) -> list[Improvement]:
 
 
 def best(found: Iterable[Row]) -> set[tuple[str, str, str]]:
-    """(map, condition, method) of the highest means where several methods are compared."""
+    """(map, condition, method) of the highest means; nothing where all are alike."""
     together: dict[tuple[str, str], list[Row]] = {}
     for row in found:
         together.setdefault((row.scenario, row.condition), []).append(row)
     out = set()
     for same in together.values():
         highest = max(row.mean for row in same)
-        if len(same) > 1:
-            out |= {(r.scenario, r.condition, r.method) for r in same if r.mean >= highest - 1e-12}
+        first = [row for row in same if row.mean >= highest - 1e-12]
+        if len(first) < len(same):
+            out |= {(row.scenario, row.condition, row.method) for row in first}
     return out
