@@ -3,6 +3,8 @@ SHELL := /bin/bash
 PYTHON ?=
 DEMO_OPTIONS ?=
 IN_ENV := . ./env.sh &&
+# Tests start hundreds of processes: each would compile the sources anew where containers forbid it.
+PYTEST := PYTHONDONTWRITEBYTECODE= pytest
 # `make check` runs these, `make test` all others.
 CHECKED := tests/test_architecture.py tests/test_documents.py
 CODE := sim_pkg policy_pkg crash_coach_pkg ros_ws/src/crash_coach_bringup tests benchmarks scripts
@@ -19,10 +21,10 @@ check: setup ## ruff, mypy, the architecture's laws, the documents' commands
 	$(IN_ENV) ruff format --check $(CODE) && ruff check $(CODE)
 	$(IN_ENV) mypy sim_pkg/sim_pkg policy_pkg/policy_pkg crash_coach_pkg/crash_coach_pkg \
 	    ros_ws/src/crash_coach_bringup/crash_coach_bringup scripts benchmarks
-	$(IN_ENV) pytest $(CHECKED)
+	$(IN_ENV) $(PYTEST) $(CHECKED)
 
 test: setup ## the test suite (but for what `make check` runs), under 5 minutes on 2 cores
-	$(IN_ENV) pytest -m "not soak" -n 2 --dist loadfile --max-worker-restart 0 $(CHECKED:%=--ignore=%)
+	$(IN_ENV) $(PYTEST) -m "not soak" -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0 $(CHECKED:%=--ignore=%)
 
 demo: setup ## train two teams, run them as ROS graphs, crash robots, read off the cost
 	$(IN_ENV) crash-coach demo $(DEMO_OPTIONS)
@@ -31,7 +33,7 @@ bench: setup ## every benchmark, to runs/bench.json
 	$(IN_ENV) python -m benchmarks
 
 soak: setup ray ## fuzz, kill and latency tests at full size
-	$(IN_ENV) pytest -m soak --timeout 3600
+	$(IN_ENV) $(PYTEST) -m soak --timeout 3600
 
 ray: setup ## the extra that `crash-coach sweep --engine ray` needs
 	@.venv/bin/uv pip install --quiet --python .venv/bin/python -r requirements-ray.lock
