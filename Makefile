@@ -23,9 +23,8 @@ check: setup ## ruff, mypy, the architecture's laws, the documents' commands
 	    ros_ws/src/crash_coach_bringup/crash_coach_bringup scripts benchmarks
 	$(IN_ENV) $(PYTEST) $(CHECKED)
 
-# Three at a time on two cores: tests of ROS graphs wait a third of their time.
 test: setup ## the test suite (but for what `make check` runs), under 5 minutes on 2 cores
-	$(IN_ENV) $(PYTEST) -m "not soak" -n 3 --dist loadfile --no-loadscope-reorder --max-worker-restart 0 $(CHECKED:%=--ignore=%)
+	$(IN_ENV) $(PYTEST) -m "not soak" -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0 $(CHECKED:%=--ignore=%)
 
 demo: setup ## train two teams, run them as ROS graphs, crash robots, read off the cost
 	$(IN_ENV) crash-coach demo $(DEMO_OPTIONS)
