@@ -90,7 +90,7 @@ def test_a_killed_sweep_ends_with_the_same_results(tmp_path: Path) -> None:
 def test_killed_ten_times_at_random_moments(tmp_path: Path) -> None:
     """Most of them while it trains, some while it starts."""
     chance = random.Random(7)
-    runs = tiny_runs(tmp_path, total_steps=20_000, seeds=[0, 1])
+    runs = tiny_runs(tmp_path, total_steps=50_000, seeds=[0, 1])
     out = tmp_path / "out"
     train_alone(runs, tmp_path / "alone")
     told = [RunFiles(out, run.name).progress for run in runs]
