@@ -102,7 +102,10 @@ def busy_cores() -> Iterator[None]:
             loop.wait(timeout=10)
 
 
-@pytest.mark.parametrize("scenario", ["transport", "skirmish/3s_vs_3z"])
+@pytest.mark.parametrize(
+    "scenario",
+    ["transport", "skirmish/3s_vs_3z", pytest.param("skirmish/8m", marks=pytest.mark.soak)],
+)
 def test_every_kind_of_scenario(tmp_path: Path, scenario: str) -> None:
     checkpoint = untrained(tmp_path, scenario)
     compare(checkpoint, CONDITIONS["rate"], "single", episodes=2, scenario=scenario)
