@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from policy_pkg.train.evaluate import Condition
 from policy_pkg.train.kept_evaluations import Result, arena
+from policy_pkg.train.results import methods_of
 from policy_pkg.train.statistics import (
     Estimate,
     binomial_weights,
@@ -92,7 +93,7 @@ def rows(results: Sequence[Result], rates: Sequence[float]) -> list[Row]:
     """
     groups: dict[str, dict[str, list[Result]]] = {}  # map -> method -> results
     maps = list(dict.fromkeys(result.run.scenario for result in results))
-    names = list(dict.fromkeys(result.run.method for result in results))
+    names = methods_of(result.run for result in results)
     for result in sorted(
         results,
         key=lambda r: (maps.index(r.run.scenario), names.index(r.run.method), r.run.seed),

@@ -77,6 +77,11 @@ def _inside(folder: Path) -> list[Path]:
     return sorted(path.parent for path in folder.glob(f"*/{RUN}"))
 
 
+def methods_of(runs: Iterable[Run]) -> list[str]:
+    """Each method once, in the order of the runs: that of tables and colours."""
+    return list(dict.fromkeys(run.method for run in runs))
+
+
 def has_begun(run: Path) -> bool:
     """Whether there is a checkpoint of it."""
     return bool(list_checkpoints(run / CHECKPOINTS))

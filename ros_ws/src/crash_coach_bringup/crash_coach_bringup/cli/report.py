@@ -28,6 +28,7 @@ from policy_pkg.train.results import (
     find_runs,
     has_begun,
     last_metrics,
+    methods_of,
     read_runs,
     wall_time_s,
 )
@@ -144,7 +145,7 @@ def _begun(paths: Sequence[Path]) -> tuple[list[Run], list[Path]]:
 
 
 def _check_methods(against: Sequence[str], runs: Sequence[Run]) -> None:
-    methods = list(dict.fromkeys(run.method for run in runs))
+    methods = methods_of(runs)
     for name in against:
         if name not in methods:
             raise CliError(f"--against {name}: no such method; there are {', '.join(methods)}")

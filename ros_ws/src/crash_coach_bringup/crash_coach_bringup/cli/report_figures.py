@@ -19,7 +19,7 @@ from policy_pkg.checkpoint import load_policy
 from policy_pkg.train.evaluate import evaluate
 from policy_pkg.train.kept_evaluations import Result
 from policy_pkg.train.report import ALL_MAPS, Improvement, Row
-from policy_pkg.train.results import Run
+from policy_pkg.train.results import Run, methods_of
 
 APART = 0.06  # between the methods' points at the same number of crashed robots
 
@@ -34,7 +34,7 @@ def write(
     """
     exact = [row for row in rows if row.crashed is not None and row.scenario != ALL_MAPS]
     # One order, and so one colour per method, in all figures.
-    methods = list(dict.fromkeys(run.method for run in runs))
+    methods = methods_of(runs)
     figures: dict[str, Figure] = {}
     if len({row.crashed for row in exact}) > 1:
         figures["resilience"] = resilience(exact, methods)
@@ -133,7 +133,7 @@ def trajectories(results: Sequence[Result], run_seed: int, seed: int, out: Path)
     if len(maps) != 1:
         found = ", ".join(sorted(maps)) or "no run"
         raise CliError(f"--trajectories {run_seed}: runs of that seed on one map; found: {found}")
-    methods = list(dict.fromkeys(result.run.method for result in results))
+    methods = methods_of(result.run for result in results)
     teams = []
     for result in chosen:
         bundle = load_policy(result.run.path)
