@@ -28,7 +28,9 @@ FORMAT = "crash-coach-checkpoint"
 VERSION = 1
 MANIFEST = "checkpoint.json"
 CHECKPOINTS = "checkpoints"
+BEST = "best"
 AGENT = "agent"
+AT_BEST = "@best"  # behind a run: its best checkpoint
 
 Tensors = dict[str, npt.NDArray[Any]]
 
@@ -161,7 +163,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def list_checkpoints(folder: Path) -> list[Path]:
-    """The complete checkpoints in a run's ``checkpoints`` folder, oldest first."""
+    """The complete checkpoints in a run's ``checkpoints`` or ``best`` folder, oldest first."""
     if not folder.is_dir():
         return []
     return sorted(
@@ -169,14 +171,36 @@ def list_checkpoints(folder: Path) -> list[Path]:
     )
 
 
+def split_best(path: Path) -> tuple[Path, bool]:
+    """A path as a user gives it: ``RUN@best`` is (RUN, True), anything else (itself, False).
+
+    A folder whose own name ends in @best is itself.
+    """
+    if path.name.endswith(AT_BEST) and path.name != AT_BEST and not path.exists():
+        return path.with_name(path.name.removesuffix(AT_BEST)), True
+    return path, False
+
+
 def find_checkpoint(path: Path) -> Path:
-    """The checkpoint directory that ``path``, one itself or a run directory, stands for.
+    """The checkpoint directory that ``path`` stands for.
+
+    Args:
+        path: one itself, a run directory (its newest counts), or RUN@best, the one that was best in
+            the run's own evaluation blocks.
 
     Raises:
         CheckpointError: there is none.
     """
+    path, best = split_best(path)
     if not path.exists():
         raise CheckpointError(f"{path}: no such file or directory")
+    if best:
+        kept = list_checkpoints(path / BEST)
+        if kept:
+            return kept[-1]
+        raise CheckpointError(
+            f"{path}{AT_BEST}: {path / BEST}/step_*/ is not there: the run kept no best checkpoint"
+        )
     if (path / MANIFEST).is_file():
         return path
     found = list_checkpoints(path / CHECKPOINTS)
@@ -244,7 +268,7 @@ def load_policy(path: str | Path) -> PolicyBundle:
     """Loads the acting half of a checkpoint.
 
     Args:
-        path: a run directory (its newest checkpoint counts) or a checkpoint directory.
+        path: as of ``find_checkpoint``.
 
     Raises:
         CheckpointError: names the file and what is wrong with it.

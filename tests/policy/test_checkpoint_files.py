@@ -74,6 +74,23 @@ def test_a_run_directory_stands_for_its_newest_checkpoint(tmp_path: Path) -> Non
     assert load_policy(tmp_path).path.name == "step_000000200"
 
 
+def test_run_at_best_stands_for_the_best(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    write(run, 30)
+    with pytest.raises(CheckpointError, match=r"run@best: .*run/best/step_\*/ is not there"):
+        find_checkpoint(tmp_path / "run@best")
+    shutil.copytree(run / "checkpoints", run / "best")
+    (run / "best" / "step_000000030").rename(run / "best" / "step_000000020")
+    assert find_checkpoint(tmp_path / "run@best") == run / "best" / "step_000000020"
+    assert load_policy(f"{run}@best").path == run / "best" / "step_000000020"
+    assert find_checkpoint(run).name == "step_000000030"
+    # A folder that is called so is itself.
+    write(tmp_path / "run@best", 7)
+    assert find_checkpoint(tmp_path / "run@best").name == "step_000000007"
+    with pytest.raises(CheckpointError, match="none: no such file"):
+        find_checkpoint(tmp_path / "none@best")
+
+
 def test_only_the_newest_are_kept_and_leftovers_go(tmp_path: Path) -> None:
     (tmp_path / "checkpoints" / "step_000000001.partial").mkdir(parents=True)
     for steps in (1, 2, 3, 4):

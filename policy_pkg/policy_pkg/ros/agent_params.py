@@ -16,7 +16,7 @@ class TeamParameters(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
-    checkpoint: str = Field("", description="run directory or checkpoint directory; see live")
+    checkpoint: str = Field("", description="run directory, RUN@best or checkpoint; see live")
     live: bool = Field(False, description="act on the weights of a trainer instead of a checkpoint")
     command_topic: str = Field(
         "command_raw", min_length=1, description="answers go to /<robot>/<this>"

@@ -92,7 +92,7 @@ class Evaluations:
         return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
 
     def _play(self, run: Run, condition: Condition) -> Outcome:
-        bundle = load_policy(run.path)
+        bundle = load_policy(run.checkpoint)
         found = evaluate(bundle, run.scenario, condition, self.episodes, self.seed)
         figures = found.summary()
         return Outcome(

@@ -1,4 +1,4 @@
-"""Finished runs: which there are, what distinguishes them, and what is worth keeping of them.
+"""Finished runs: which there are, and what distinguishes them.
 
 Two runs on one map are two seeds of one method where their settings are equal; the seed and the
 length of the run are no settings. What a method is called comes from the folders' names.
@@ -9,7 +9,6 @@ from __future__ import annotations
 import gzip
 import json
 import re
-import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,17 +18,19 @@ from pydantic import ValidationError
 
 from policy_pkg.checkpoint import (
     AGENT,
+    AT_BEST,
+    BEST,
     CHECKPOINTS,
     MANIFEST,
     find_checkpoint,
     list_checkpoints,
     read_manifest,
+    split_best,
 )
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.offline_config import OfflineConfig
 from policy_pkg.train.run_dir import METRICS, RUN, TIMING, RunError, flat, read_run, seedless_name
 
-AGENT_FILES = (f"{AGENT}.safetensors", MANIFEST)
 LENGTHS = ("total_steps", "gradient_steps")  # of a run: trained in the simulator, or offline
 NO_SETTING = {
     *("scenario", "seed", *LENGTHS),
@@ -39,12 +40,13 @@ NO_SETTING = {
 
 @dataclass(frozen=True)
 class Run:
-    """A run with a checkpoint; ``agent``: SHA-256 of the weights that act.
+    """A run and the checkpoint of it that acts; ``agent``: SHA-256 of that one's weights.
 
-    ``settings``: what its method consists of. ``steps``: of the newest checkpoint.
+    ``settings``: what its method consists of. ``steps``: how far the run has come.
     """
 
     path: Path
+    checkpoint: Path
     method: str
     scenario: str
     seed: int
@@ -57,19 +59,31 @@ class Run:
     def finished(self) -> bool:
         return self.steps >= self.total_steps
 
+    @property
+    def is_best(self) -> bool:
+        """Whether it acts as RUN@best names it, instead of with its newest checkpoint."""
+        return self.checkpoint.parent.name == BEST
+
+    @property
+    def checkpoint_steps(self) -> int:
+        return steps_of(self.checkpoint)
+
 
 def find_runs(folders: Iterable[Path]) -> list[Path]:
     """Run directories, each given as itself or by the folder it lies in; in order of their names.
+
+    Behind either, @best asks for the runs' best checkpoints; it stays behind their paths.
 
     Raises:
         RunError: a folder that is no run and holds none.
     """
     found: list[Path] = []
-    for folder in folders:
+    for given in folders:
+        folder, best = split_best(given)
         inside = [folder] if (folder / RUN).is_file() else _inside(folder)
         if not inside:
             raise RunError(f"{folder}: neither a run nor a folder of runs: no {RUN}, no */{RUN}")
-        found += inside
+        found += [p.with_name(p.name + AT_BEST) for p in inside] if best else inside
     return list(dict.fromkeys(found))
 
 
@@ -83,8 +97,9 @@ def methods_of(runs: Iterable[Run]) -> list[str]:
 
 
 def has_begun(run: Path) -> bool:
-    """Whether there is a checkpoint of it."""
-    return bool(list_checkpoints(run / CHECKPOINTS))
+    """Whether there is a checkpoint of it, of RUN@best one that was best."""
+    path, best = split_best(run)
+    return bool(list_checkpoints(path / (BEST if best else CHECKPOINTS)))
 
 
 def read_runs(paths: Iterable[Path]) -> list[Run]:
@@ -107,7 +122,8 @@ def read_runs(paths: Iterable[Path]) -> list[Run]:
     return longer
 
 
-def _read(path: Path) -> Run:
+def _read(given: Path) -> Run:
+    path, best = split_best(given)
     content = read_run(path)["config"]
     model = TrainConfig if "total_steps" in content else OfflineConfig
     try:
@@ -116,28 +132,30 @@ def _read(path: Path) -> Run:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
         raise RunError(f"{path / RUN}: config.{place}: {first['msg']}") from error
-    checkpoint = find_checkpoint(path)
+    checkpoint = find_checkpoint(given)
     manifest = read_manifest(checkpoint)
     if AGENT not in manifest.files:
         raise RunError(f"{checkpoint / MANIFEST} lists no {AGENT}.safetensors")
     settings = {key: value for key, value in config.items() if key not in NO_SETTING}
+    made = [*list_checkpoints(path / BEST), *list_checkpoints(path / CHECKPOINTS)]
     return Run(
         path=path,
-        method=method_name(path, manifest.scenario, settings),
+        checkpoint=checkpoint,
+        method=method_name(path, manifest.scenario, settings) + (AT_BEST if best else ""),
         scenario=manifest.scenario,
         seed=config["seed"],
         settings=settings,
-        steps=_steps(checkpoint),
-        total_steps=_wanted(config),
+        steps=max(map(steps_of, made)),
+        total_steps=wanted_steps(config),
         agent=manifest.files[AGENT].sha256,
     )
 
 
-def _steps(checkpoint: Path) -> int:
+def steps_of(checkpoint: Path) -> int:
     return int(checkpoint.name.removeprefix("step_"))
 
 
-def _wanted(config: Mapping[str, Any]) -> int:
+def wanted_steps(config: Mapping[str, Any]) -> int:
     """How many steps the run is meant to take."""
     return int(next(config[key] for key in LENGTHS if key in config))
 
@@ -247,42 +265,3 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
         return [json.loads(line) for line in text.splitlines()]
     except ValueError as error:
         raise RunError(f"{path} cannot be read: {error}") from error
-
-
-def collect(run: Path, results: Path) -> str | None:
-    """Copies what a report and an evaluation need of a finished run to ``results``/<its name>.
-
-    That is run.json, the metrics and the timing (compressed) and the last agent, some 100 kB.
-    A copy made before is replaced.
-
-    Returns:
-        Why nothing was copied, for a run that is not finished; else None.
-
-    Raises:
-        RunError: a damaged run, or something else of that name in ``results``.
-        OSError: it could not be written.
-    """
-    wanted = _wanted(read_run(run)["config"])
-    made = list_checkpoints(run / CHECKPOINTS)
-    done = _steps(made[-1]) if made else 0
-    if done < wanted:
-        return f"{run}: not finished: checkpoint at {done:,} of {wanted:,} steps"
-    kept = results / run.name
-    if kept.resolve() == run.resolve() or (kept.exists() and not (kept / RUN).is_file()):
-        raise RunError(f"{kept} is not a copy of {run}: choose another folder for the results")
-    partial = results / f"{run.name}.partial"
-    shutil.rmtree(partial, ignore_errors=True)
-    last = made[-1]
-    agent = partial / CHECKPOINTS / last.name
-    agent.mkdir(parents=True)
-    for name in AGENT_FILES:
-        shutil.copyfile(last / name, agent / name)
-    shutil.copyfile(run / RUN, partial / RUN)
-    for name in (METRICS, TIMING):
-        if (run / name).is_file():
-            packed = gzip.compress((run / name).read_bytes(), mtime=0)
-            (partial / f"{name}.gz").write_bytes(packed)
-    if kept.exists():
-        shutil.rmtree(kept)
-    partial.rename(kept)
-    return None

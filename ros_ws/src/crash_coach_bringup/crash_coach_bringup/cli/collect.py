@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from crash_coach_bringup.cli.output import CliError, console
-from policy_pkg.train.results import collect as collect_run
+from policy_pkg.train.collect import collect as collect_run
 from policy_pkg.train.results import find_runs
 
 

@@ -60,6 +60,10 @@ def asked(
     return found
 
 
+FoldersArgument = Annotated[
+    list[Path] | None,
+    typer.Argument(metavar="DIR", help="Runs, folders of runs; DIR@best: their best checkpoints."),
+]
 CrashedOption = Annotated[
     list[int] | None,
     typer.Option(help="K ...: exactly K robots crash, drawn anew each episode. [default: 0 1 2]"),
@@ -85,9 +89,7 @@ AgainstOption = Annotated[
 
 
 def report(
-    folders: Annotated[
-        list[Path] | None, typer.Argument(metavar="DIR", help="Runs, or folders of runs.")
-    ] = None,
+    folders: FoldersArgument = None,
     out: Annotated[
         Path, typer.Option(help="Folder for the tables and figures; goes on where it was left.")
     ] = Path("report"),
@@ -158,7 +160,8 @@ def _play(
     for run in runs:
 
         def say(condition: Condition, run: Run = run) -> None:
-            text = f"{run.path} on {run.scenario}: {condition.name}"
+            best = " (best)" if run.is_best else ""
+            text = f"{run.path}{best} on {run.scenario}: {condition.name}"
             console.print(text, markup=False, highlight=False, soft_wrap=True)
 
         results.append(evaluations.result(run, wanted[run.scenario], say))
@@ -174,6 +177,8 @@ def describe(result: Result) -> dict[str, Any]:
         "method": run.method,
         "seed": run.seed,
         "steps": run.steps,
+        "checkpoint": "best" if run.is_best else "last",
+        "checkpoint_steps": run.checkpoint_steps,
         "total_steps": run.total_steps,
         "settings": run.settings,
         "gradient_steps": metrics.get("gradient_steps"),

@@ -136,7 +136,7 @@ def trajectories(results: Sequence[Result], run_seed: int, seed: int, out: Path)
     methods = methods_of(result.run for result in results)
     teams = []
     for result in chosen:
-        bundle = load_policy(result.run.path)
+        bundle = load_policy(result.run.checkpoint)
         scenario = result.run.scenario
         first = [(c, evaluate(bundle, scenario, c, 1, seed)) for c, _ in result.outcomes]
         colour, _ = style(methods.index(result.run.method))

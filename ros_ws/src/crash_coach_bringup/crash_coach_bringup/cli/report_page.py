@@ -28,7 +28,8 @@ def page(
         mode += f" ({values})"
     parts = [
         f"Success in % of {about['episodes']} greedy episodes per run and condition (evaluation "
-        f"seed {about['seed']}, the same episodes for every run; crashed robots: {mode}).",
+        f"seed {about['seed']}, the same episodes for every run; crashed robots: {mode}). "
+        + _checkpoints(runs),
     ]
     if len({row.method for row in rows}) > 1:
         parts += ["## Methods", "Mean ± sample standard deviation over seeds; best in bold."]
@@ -40,6 +41,16 @@ def page(
     waiting = [f"{path} has no checkpoint yet: left out." for path in about["without_checkpoint"]]
     parts += [f"- {note}" for note in (*waiting, *notes(rows, runs), *differences)]
     return "\n\n".join(parts) + "\n"
+
+
+def _checkpoints(runs: Sequence[Mapping[str, Any]]) -> str:
+    """Which of a run's checkpoints the figures are of."""
+    if all(run["checkpoint"] == "last" for run in runs):
+        return "Of every run its last checkpoint acts."
+    return (
+        "Of runs called METHOD@best the checkpoint acts that was best in the run's own evaluation "
+        "blocks, of others the last one; the episodes here are none of those that chose it."
+    )
 
 
 def figure(rate: float) -> str:
@@ -131,9 +142,11 @@ def _runs(runs: Sequence[Mapping[str, Any]]) -> str:
         alpha = NONE if run["new_alpha"] is None else f"{run['new_alpha']:.2f}"
         updates = NONE if run["gradient_steps"] is None else f"{run['gradient_steps']:,}"
         cells = [_outcome(run["outcomes"].get(name)) for name in names]
-        head = (run["scenario"], run["method"], run["seed"], f"{run['steps']:,}", updates)
+        acts = f"{run['checkpoint']}, {run['checkpoint_steps']:,}"
+        head = (run["scenario"], run["method"], run["seed"], f"{run['steps']:,}", acts, updates)
         lines.append([*head, _minutes(run["wall_s"]), alpha, *cells])
-    columns = ["map", "method", "seed", "steps", "gradient steps", "wall time", "α at the end"]
+    columns = ["map", "method", "seed", "steps", "checkpoint"]
+    columns += ["gradient steps", "wall time", "α at the end"]
     return table([*columns, *names], lines)
 
 

@@ -11,7 +11,7 @@ from policy_pkg.train.evaluate import Scripted
 from sim_pkg.env import make_env
 
 SCRIPTED = "scripted:"
-HELP = "Run directory, checkpoint directory, or scripted:NAME."
+HELP = "Run directory (RUN@best: its best checkpoint), checkpoint directory, or scripted:NAME."
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ def show(event: Event) -> None:
 
 def up(
     scenario: Annotated[str, typer.Argument(help="Scenario name or YAML file.")],
-    policy: Annotated[Path, typer.Option(help="Run directory or checkpoint directory.")],
+    policy: Annotated[Path, typer.Option(help="Run directory, RUN@best, or checkpoint directory.")],
     mode: Annotated[
         Mode, typer.Option(help="As fast as every robot answers, or by the clock.")
     ] = Mode.lockstep,

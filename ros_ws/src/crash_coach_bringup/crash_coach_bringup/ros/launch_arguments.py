@@ -25,7 +25,7 @@ class LaunchArgument:
 
 ARGUMENTS = (
     LaunchArgument("scenario", "Scenario name or YAML file.", "buttons"),
-    LaunchArgument("checkpoint", "Run directory or checkpoint directory of the team."),
+    LaunchArgument("checkpoint", "Run directory, RUN@best, or checkpoint directory of the team."),
     LaunchArgument("mode", "By the clock, or as fast as every robot answers.", "realtime", MODES),
     LaunchArgument("layout", "A policy process per robot, or one for the team.", "nodes", LAYOUTS),
     LaunchArgument("seed", "Seed of episodes and crashes.", "0"),
