@@ -1,1 +1,5 @@
 """Decentralised QMIX agents: acting (numpy), training (torch, under train/), and ROS 2 nodes."""
+
+from policy_pkg.kernels import pin_kernels
+
+pin_kernels()

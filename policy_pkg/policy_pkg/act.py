@@ -27,15 +27,59 @@ def least_valued(q: FloatArray, available: BoolArray) -> IntArray:
     return worst
 
 
-def epsilon_greedy(
-    q: FloatArray, available: BoolArray, epsilon: float, rng: np.random.Generator
-) -> IntArray:
-    """Each row on its own: with probability ``epsilon`` a uniform available action, else greedy.
+class Explorer:
+    """Epsilon-greedy for B teams of n robots, each robot on its own; a random action may last.
 
-    q, available: (..., A). Takes the same number of draws from ``rng`` whatever the values are.
+    A random action, once drawn, is held for d steps, P(d) proportional to 1 / (d (d + 1)),
+    d <= ``longest``, while it is available: temporally extended epsilon-greedy (Dabney et al.
+    2021). They start so rarely that epsilon stays the share of random steps.
+
+    longest: 1: every random action is drawn anew, plain epsilon-greedy.
     """
-    draws = rng.random((2, *q.shape[:-1]))
-    return _mixed(greedy(q, available), available, epsilon, draws)
+
+    def __init__(self, arenas: int, robots: int, longest: int = 1) -> None:
+        if longest < 1:
+            raise ValueError(f"longest random action: {longest} steps; must be at least 1")
+        self.action: IntArray = np.zeros((arenas, robots), dtype=np.int32)
+        """(B, n) held."""
+        self.left: IntArray = np.zeros((arenas, robots), dtype=np.int32)
+        """(B, n) further steps for which it is held."""
+        steps = np.arange(1, longest + 1)
+        # sum of 1 / (k (k + 1)) up to d is d / (d + 1)
+        self._up_to = steps / (steps + 1) * (longest + 1) / longest
+        self._mean_steps = float(np.sum(1 / (steps + 1))) * (longest + 1) / longest
+
+    @property
+    def lasting(self) -> bool:
+        return len(self._up_to) > 1
+
+    def begin(self, arenas: npt.NDArray[np.intp]) -> None:
+        """Nothing is held in ``arenas`` any more: episodes start there."""
+        self.left[arenas] = 0
+
+    def choose(
+        self, q: FloatArray, available: BoolArray, epsilon: float, rng: np.random.Generator
+    ) -> IntArray:
+        """(B, n) actions for (B, n, A) values and availability; goes on by a step.
+
+        Takes the same number of draws from ``rng`` whatever the values are.
+        """
+        best = greedy(q, available)
+        draws = rng.random((3 if self.lasting else 2, *best.shape))
+        if not self.lasting:
+            return _mixed(best, available, epsilon, draws)
+        possible = np.take_along_axis(available, self.action[..., np.newaxis], -1)[..., 0]
+        held = (self.left > 0) & possible
+        # Of all steps that are not held a share p starts a random action of m steps on average:
+        # p m / (p m + 1 - p) of the steps are random, which is to be epsilon.
+        share = epsilon / (self._mean_steps * (1 - epsilon) + epsilon)
+        starts = ~held & (draws[0] < share)
+        fresh = _mixed(best, available, share, draws[:2])
+        steps = np.searchsorted(self._up_to, draws[2], side="right") + 1
+        chosen: IntArray = np.where(held, self.action, fresh).astype(np.int32)
+        left = np.where(starts, np.minimum(steps, len(self._up_to)), np.where(held, self.left, 1))
+        self.action, self.left = chosen.copy(), (left - 1).astype(np.int32)
+        return chosen
 
 
 @dataclass(frozen=True)

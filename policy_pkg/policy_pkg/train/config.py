@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from crash_coach_pkg.config import CoachConfig
 from policy_pkg.train.learner_config import LearnerConfig
+from policy_pkg.train.strata import Strata
 from sim_pkg.config import (
     ConfigError,
     YamlTree,
@@ -46,10 +47,21 @@ class TrainConfig(BaseModel):
     )
     batch_episodes: int = Field(32, ge=1, description="episodes of one gradient step")
     replay_episodes: int = Field(5_000, ge=1, description="episodes that the replay keeps")
+    replay_strata: Strata = Field(
+        "none",
+        description="draw half of the episodes evenly over strata: by which robots crashed, or by "
+        "outcome (that and success); none: uniformly",
+    )
     epsilon_start: float = Field(1.0, ge=0, le=1, description="exploration at the start")
     epsilon_finish: float = Field(0.05, ge=0, le=1, description="exploration after annealing")
     epsilon_anneal_steps: int = Field(
         50_000, ge=1, description="environment steps over which epsilon falls linearly"
+    )
+    explore_hold: int = Field(
+        1,
+        ge=1,
+        le=1_000,
+        description="longest random action, control steps: drawn once, then held; 1: drawn anew",
     )
     test_interval_steps: int = Field(
         10_000, ge=1, description="environment steps between two evaluation blocks"
@@ -57,6 +69,11 @@ class TrainConfig(BaseModel):
     test_episodes: int = Field(32, ge=1, description="greedy episodes of an evaluation block")
     test_crash_free: bool = Field(
         True, description="play each block's episodes without crashes too, for the learning curve"
+    )
+    test_victim_episodes: int = Field(
+        0,
+        ge=0,
+        description="greedy episodes per block and robot in which that robot alone crashes; 0: none",
     )
     checkpoint_interval_steps: int = Field(
         100_000, ge=1, description="environment steps between two checkpoints, at block ends"

@@ -4,6 +4,11 @@
     y    = r + gamma * (1 - terminated) * Q_tot(s', a*; target)
     loss = mean of (y - Q_tot(s, a))^2 over the valid steps, those with t < T
 
+With td_lambda > 0, y is Peng's lambda-return (Peng and Williams 1996) over the stored episode, from
+its end backwards and without cuts, V the target's value above:
+
+    y_t = r_t + gamma * ((1 - lambda) * V(s_t+1) + lambda * y_t+1),  one-step at the last t
+
 as in double Q-learning (van Hasselt et al. 2016) with QMIX's Q_tot; VDN's is the sum of the robots'
 values (Sunehag et al. 2018); IQL has no mixer: each robot gets the team's reward and the mean runs
 over steps and robots. On fixed data a conservative term is added, conservative_weight times
@@ -157,9 +162,7 @@ class Learner:
     ) -> tuple[dict[str, float], Array]:
         """Loss and means, and the gradient of ``value``: (M,) of the team, for iql (M, n)."""
         steps = (-1,) + (1,) * (value.ndim - 1)
-        reward = self._cast(batch.reward).reshape(steps)
-        bootstrap = self._cast(batch.bootstrap).reshape(steps)
-        target = reward + self.config.gamma * bootstrap * following
+        target = self._targets(batch, following)
         assert target.shape == value.shape
         error, count = target - value, value.size
         if self.config.crashed_loss == "drop":
@@ -177,6 +180,19 @@ class Learner:
             squared, error = squared * factor, error * factor
         metrics["loss"] = float(squared.sum()) / count
         return metrics, error * (-2.0 / count)
+
+    def _targets(self, batch: Batch, following: Array) -> Array:
+        """y of every step, shaped as ``following``: (M,) of the team, for iql (M, n)."""
+        reward, bootstrap = self._cast(batch.reward), self._cast(batch.bootstrap)
+        gamma, td_lambda = self.config.gamma, self.config.td_lambda
+        if td_lambda == 0:
+            steps = (-1,) + (1,) * (following.ndim - 1)
+            one_step: Array = reward.reshape(steps) + gamma * bootstrap.reshape(steps) * following
+            return one_step
+        flat = np.ascontiguousarray(following).reshape(len(reward), -1)
+        out, weights = np.empty_like(flat), np.array([1 - td_lambda, td_lambda], self.dtype)
+        _lambda_returns(reward, gamma * bootstrap, flat, batch.alive, weights, out)
+        return out.reshape(following.shape)
 
     def _next_values(self, batch: Batch, q_online: Array, q_target: Array) -> Array:
         """(M, n) the target net's value of each robot's next action; inputs (M, n, A)."""
@@ -251,6 +267,32 @@ def _shapes(config: LearnerConfig, sizes: Sizes) -> tuple[Shapes, dict[str, int]
     shapes = {f"{net}.{k}": v for net, (named, _) in parts.items() for k, v in named.items()}
     fan_in = {f"{net}.{k}": v for net, (_, fans) in parts.items() for k, v in fans.items()}
     return shapes, fan_in
+
+
+@njit(cache=True)
+def _lambda_returns(
+    reward: Array,
+    discount: Array,
+    following: Array,
+    alive: Array,
+    weights: Array,
+    out: Array,
+) -> None:
+    """out = lambda-returns of packed steps, (M, k) for (M,) rewards; see the module's text.
+
+    weights: (2,) 1 - lambda and lambda. The steps at t are ``alive[t + 1]`` rows; row i of them is
+    followed by row i of the next t, where there is one: the returns come from the last t backwards.
+    """
+    end, behind = out.shape[0], 0
+    for t in range(alive.shape[0] - 1, 0, -1):
+        begin = end - alive[t]
+        for i in range(alive[t]):
+            for k in range(out.shape[1]):
+                value = following[begin + i, k]
+                if i < behind:
+                    value = weights[0] * value + weights[1] * out[end + i, k]
+                out[begin + i, k] = reward[begin + i] + discount[begin + i] * value
+        end, behind = begin, alive[t]
 
 
 @njit(cache=True)

@@ -45,6 +45,12 @@ class LearnerConfig(BaseModel):
         ge=1,
         description="finished training episodes between two copies to the target nets",
     )
+    td_lambda: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=1.0,
+        description="share of the lambda-return in the target; 0: one-step targets",
+    )
     double_q: bool = Field(
         default=True,
         description="choose the next action by the online net, value it by the target net",

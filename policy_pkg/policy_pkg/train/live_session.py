@@ -38,9 +38,15 @@ class LiveSession:
 
     def __init__(self, config: TrainConfig, spec: EnvSpec) -> None:
         self.config, self.spec = config, spec
+        for key, off in (("explore_hold", 1), ("test_victim_episodes", 0)):
+            if (value := getattr(config, key)) != off:
+                raise UserError(
+                    f"{key} {value}: must be {off} in live training, whose policy nodes explore "
+                    "step by step and whose blocks the coach's node plans"
+                )
         sizes = Sizes.of(spec)
         self.learner = Learner(config.learner, sizes, config.seed)
-        self.replay = Replay(config.replay_episodes, sizes)
+        self.replay = Replay(config.replay_episodes, sizes, config.replay_strata)
         self.sampling = generator(config.seed, SAMPLING)
         self.counters, self.means = Counters(), Means()
         self.next_episodes = [0] * config.n_envs
@@ -89,7 +95,7 @@ class LiveSession:
         """
         done, config, episode = self.counters, self.config, recorded.episode
         try:
-            self.replay.add(episode)
+            self.replay.add(episode, recorded.success)
         except ValueError as error:
             raise UserError(
                 f"episode {recorded.number} does not fit scenario {config.scenario!r}: {error}"

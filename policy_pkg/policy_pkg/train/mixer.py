@@ -66,7 +66,9 @@ def qmix(params: Params, q: Array, state: Array) -> tuple[Array, Tape]:
     inner = np.empty_like(w2)
     _mix(q, w1, first[:, 2 * hypernet + mixing :], inner)
     # ELU: x where x > 0, else exp(x) - 1
-    inner = np.maximum(inner, 0) + np.expm1(np.minimum(inner, 0))
+    # by tanh, whose bits do not depend on the processor as those of numpy's expm1 do
+    half = np.tanh(np.minimum(inner, 0) / 2)
+    inner = np.maximum(inner, 0) + 2 * half / (1 - half)
     total: Array = np.einsum("mk,mk->m", inner, np.abs(w2)) + v
     return total, Tape(q, state, first, w1, w2, inner)
 

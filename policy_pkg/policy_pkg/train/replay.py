@@ -6,6 +6,9 @@ At time t only the first ``alive[t]`` episodes still have an observation, so no 
     t:        0        1        2     3
     rows:  e0 e1 e2 e0 e1 e2 e0 e1  e0        lengths T = 3, 2, 1
 
+Episodes are drawn uniformly, or half of the probability is spread evenly over strata: by which
+robots were faulted, and, for outcome, by success. What is rare is then not forgotten.
+
 Step t of episode i exists where t < T_i, which is exactly where observation t+1 exists. So the
 M valid steps, in the same order, are the observation rows from ``alive[0]`` on, moved back by one.
 """
@@ -22,9 +25,11 @@ import numpy.typing as npt
 from numba import njit
 
 from policy_pkg.train.episode import Episode, Sizes
+from policy_pkg.train.strata import Strata
 
 Array = npt.NDArray[Any]
 _ALIGNMENT_BYTES = 64
+_EVEN_SHARE = 0.5  # of the sampling probability, spread evenly over the strata
 
 
 @dataclass(frozen=True)
@@ -66,12 +71,16 @@ class Batch:
 
 
 class Replay:
-    """The newest ``capacity`` episodes. Memory is committed by the system as it is written."""
+    """The newest ``capacity`` episodes. Memory is committed by the system as it is written.
 
-    def __init__(self, capacity: int, sizes: Sizes) -> None:
+    strata: what ``sample`` draws evenly over, besides uniformly: nothing; which robots were
+        faulted (crashed); that and success (outcome).
+    """
+
+    def __init__(self, capacity: int, sizes: Sizes, strata: Strata = "none") -> None:
         if capacity < 1:
             raise ValueError(f"replay capacity is {capacity}; must be at least 1")
-        self.sizes, self.capacity = sizes, capacity
+        self.sizes, self.capacity, self.strata = sizes, capacity, strata
         steps, n = sizes.episode_limit, sizes.n_robots
         self._store: dict[str, Array] = {
             "obs": _lazy((capacity, steps + 1, n, sizes.obs_size), np.float32),
@@ -83,6 +92,8 @@ class Replay:
         }
         self._length = np.zeros(capacity, np.int64)
         self._terminated = np.zeros(capacity, np.bool_)
+        self._success = np.zeros(capacity, np.bool_)
+        self._crashed = np.zeros((capacity, n), np.bool_)  # as in ``faults``
         self._added = 0
         self._buffers: dict[str, Array] = {}
 
@@ -104,10 +115,11 @@ class Replay:
     def nbytes_bound(self) -> int:
         """Bytes that the ring can ever take: ``capacity`` episodes of full length."""
         whole = sum(store.nbytes for store in self._store.values())
-        return whole + self._length.nbytes + self._terminated.nbytes
+        flags = self._terminated.nbytes + self._success.nbytes + self._crashed.nbytes
+        return whole + self._length.nbytes + flags
 
-    def add(self, episode: Episode) -> None:
-        """Copies an episode in, over the oldest one when full.
+    def add(self, episode: Episode, success: bool = False) -> None:
+        """Copies an episode in, over the oldest one when full. ``success``: for strata by outcome.
 
         Raises:
             ValueError: an array of a wrong shape or dtype, or an unknown action.
@@ -119,17 +131,42 @@ class Replay:
             store[slot, : source.shape[0]] = source
         self._length[slot] = episode.length
         self._terminated[slot] = episode.terminated
+        self._success[slot] = success
+        self._crashed[slot] = (episode.faults != 0).any(axis=0)
         self._added += 1
 
     def sample(self, rng: np.random.Generator, batch: int) -> Batch:
-        """``batch`` different episodes, each set equally likely.
+        """``batch`` different episodes: without strata each set equally likely, with strata drawn
+        one after another with ``probabilities``.
 
         Raises:
             ValueError: fewer episodes are stored.
         """
         if not 1 <= batch <= len(self):
             raise ValueError(f"batch of {batch} episodes asked of a replay that holds {len(self)}")
-        return self.gather(rng.choice(len(self), size=batch, replace=False, shuffle=False))
+        chances = None if self.strata == "none" else self.probabilities()
+        return self.gather(
+            rng.choice(len(self), size=batch, replace=False, shuffle=False, p=chances)
+        )
+
+    def probabilities(self) -> npt.NDArray[np.float64]:
+        """(len,) of each stored episode to be the first one drawn; sum 1.
+
+        Half of it is uniform, half is spread evenly over the strata that exist and within each
+        uniform. Without strata all of it is uniform.
+        """
+        count = len(self)
+        uniform = np.full(count, 1.0 / count)
+        if self.strata == "none":
+            return uniform
+        keys = self._crashed[:count]
+        if self.strata == "outcome":
+            keys = np.concatenate((keys, self._success[:count, np.newaxis]), axis=1)
+        packed = np.packbits(keys, axis=1)
+        _, stratum, sizes = np.unique(packed, axis=0, return_inverse=True, return_counts=True)
+        even = 1.0 / (len(sizes) * sizes[stratum.reshape(-1)])
+        chances: npt.NDArray[np.float64] = (1 - _EVEN_SHARE) * uniform + _EVEN_SHARE * even
+        return chances
 
     def gather(self, slots: npt.NDArray[np.int64]) -> Batch:
         """The packed batch of the given stored episodes (0 <= slot < len); one may come twice."""
@@ -185,6 +222,7 @@ class Replay:
             "added": np.array([self._added], np.int64),
             "length": self._length[:count].copy(),
             "terminated": self._terminated[:count].copy(),
+            "success": self._success[:count].copy(),
         }
         for name, store in self._store.items():
             ends = self._length[:count] + (store.shape[1] - self.sizes.episode_limit)
@@ -198,7 +236,7 @@ class Replay:
         Raises:
             ValueError: the arrays belong to a replay of other sizes, or an array is missing.
         """
-        missing = sorted({"added", "length", "terminated", *self._store} - set(arrays))
+        missing = sorted({"added", "length", "terminated", "success", *self._store} - set(arrays))
         if missing:
             raise ValueError(f"replay state lacks {', '.join(missing)}")
         added, lengths = int(arrays["added"][0]), arrays["length"]
@@ -225,6 +263,10 @@ class Replay:
         self._length[:] = 0
         self._length[:count] = lengths
         self._terminated[:count] = arrays["terminated"]
+        self._success[:count] = arrays["success"]
+        faults = self._store["faults"]
+        for slot, length in enumerate(lengths):
+            self._crashed[slot] = (faults[slot, :length] != 0).any(axis=0)
         self._added = added
 
 

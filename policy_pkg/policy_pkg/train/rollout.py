@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from crash_coach_pkg.action_tools import UNTOLD
 from crash_coach_pkg.plan import CrashPlan, Fault, Trigger, TriggerKind
-from policy_pkg.act import epsilon_greedy
+from policy_pkg.act import Explorer
 from policy_pkg.checkpoint import CheckpointError
 from policy_pkg.policy import RecurrentPolicy
 from policy_pkg.train.arenas import ArenaArray, Arenas, Executed
@@ -43,6 +43,7 @@ class Rollout:
         plan: the crash plan of an episode, asked when the episode starts.
         seed: of the environment.
         rng: of exploration.
+        explore_hold: longest random action, control steps.
     """
 
     def __init__(
@@ -52,11 +53,13 @@ class Rollout:
         plan: Callable[[int], CrashPlan],
         seed: int,
         rng: np.random.Generator,
+        explore_hold: int = 1,
     ) -> None:
         self._env = env
         self._rng = rng
         self._team = RecurrentTeam(policy, env)
         self._arenas = Arenas(env, self._team, plan, seed)
+        self._explorer = Explorer(env.n_arenas, env.spec.n_robots, explore_hold)
         self._next_episode = 0
         self._waiting: ArenaArray = np.arange(env.n_arenas)
         self._index = np.arange(env.n_arenas)
@@ -85,7 +88,7 @@ class Rollout:
         self._start_waiting()
         seen = self._arenas.sense()
         q = self._team.values(seen, self._arenas.last_action)
-        intent = epsilon_greedy(q, self._env.available, epsilon, self._rng)
+        intent = self._explorer.choose(q, self._env.available, epsilon, self._rng)
         self._record_before(seen, intent)
         worst = self._arenas.worst()
         if worst is not None:
@@ -102,6 +105,7 @@ class Rollout:
             self._arenas.start(
                 self._waiting, np.arange(self._next_episode, self._next_episode + count)
             )
+            self._explorer.begin(self._waiting)
             self._next_episode += count
 
     def _record_before(self, seen: FloatArray, intent: IntArray) -> None:
@@ -152,6 +156,8 @@ class Rollout:
             "worst": self._worst,
             "hidden": self._team.hidden,
             "obs": np.ascontiguousarray(self._env.obs),
+            "held_action": self._explorer.action,
+            "held_left": self._explorer.left,
         }
         plans = [None if p is None else plan_to_json(p) for p in arenas.plans]
         rng = dict(self._rng.bit_generator.state)
@@ -178,6 +184,8 @@ class Rollout:
                 "this checkpoint: it was changed, or this is another version or machine type"
             )
         self._team.hidden = arrays["hidden"].copy()
+        self._explorer.action = arrays["held_action"].copy()
+        self._explorer.left = arrays["held_left"].copy()
         self._waiting = np.flatnonzero(steps < 0)
         self._next_episode = int(values["next_episode"])
         self._rng.bit_generator.state = values["rng"]

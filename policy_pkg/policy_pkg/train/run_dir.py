@@ -6,6 +6,7 @@
     metrics.jsonl     one line per evaluation block (see metrics)
     timing.jsonl      the clock's figures of the same blocks
     checkpoints/step_000100000/
+    best/step_000090000/      the acting half at the best of the run's own evaluation blocks
     tensorboard/
 """
 
@@ -25,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from policy_pkg.checkpoint import CHECKPOINTS
+from policy_pkg.kernels import kernels
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.offline_config import OfflineConfig
 from sim_pkg.contract import UserError
@@ -103,6 +105,7 @@ def describe_run(config: RunConfig, data: dict[str, Any] | None = None) -> dict[
             **{name: version(name) for name in LIBRARIES},
         },
         "machine": platform.machine(),
+        "kernels": kernels(),
         "commit": _commit(),
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
     }
@@ -154,8 +157,8 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return out
 
 
-def checkpoint_path(out_dir: Path, env_steps: int) -> Path:
-    return out_dir / CHECKPOINTS / f"step_{env_steps:09d}"
+def checkpoint_path(out_dir: Path, env_steps: int, kind: str = CHECKPOINTS) -> Path:
+    return out_dir / kind / f"step_{env_steps:09d}"
 
 
 def seedless_name(run: Path) -> str:

@@ -16,7 +16,7 @@ from crash_coach_pkg.strategies import Progress
 from policy_pkg.policy import RecurrentPolicy
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.episode import Sizes
-from policy_pkg.train.evaluate import Condition, Evaluation, crash_free, evaluate_in
+from policy_pkg.train.evaluate import Condition, Evaluation, crash_free, evaluate_in, named
 from policy_pkg.train.learner import Learner
 from policy_pkg.train.metrics import Means, Value
 from policy_pkg.train.replay import Replay
@@ -63,6 +63,26 @@ class Block:
 
     crashed: Evaluation  # crashes drawn at the coach's rate
     crash_free: Evaluation | None  # the same episodes without crashes
+    victims: tuple[Evaluation, ...] = ()  # one per robot, which alone crashes
+
+    @property
+    def conditions(self) -> tuple[Evaluation, ...]:
+        """All that were played, each once."""
+        free = () if self.crash_free in (None, self.crashed) else (self.crash_free,)
+        return (*free, self.crashed, *self.victims)
+
+    @property
+    def worst_success(self) -> float:
+        """Success rate under the worst of the conditions."""
+        return min(played.success_rate for played in self.conditions)
+
+    @property
+    def rank(self) -> tuple[float, ...]:
+        """Orders blocks: of blocks with crashes, which tell more than those without, the one whose
+        worst condition is best; then by the mean over conditions."""
+        crashed = any(episode.crashed for played in self.conditions for episode in played.episodes)
+        mean = float(np.mean([played.success_rate for played in self.conditions]))
+        return float(crashed), self.worst_success, mean
 
 
 def block_line(
@@ -94,6 +114,11 @@ def block_line(
         "new_alpha": record.new_rate,
         "success_crash_free": free.success_rate if free and reports_success else None,
         "return_crash_free": free.return_mean if free else None,
+        "success_worst": block.worst_success if reports_success else None,
+        **{
+            f"success_{played.robots[i]}_crashed": played.success_rate if reports_success else None
+            for i, played in enumerate(block.victims)
+        },
         **means,
         "updates_per_episode": config.updates_per_episode,
     }
@@ -134,10 +159,16 @@ class Session:
         sizes = Sizes.of(spec)
         self.learner = Learner(config.learner, sizes, config.seed)
         self.policy = RecurrentPolicy(self.learner.agent_weights(), spec.n_robots, spec.n_actions)
-        self.replay = Replay(config.replay_episodes, sizes)
+        self.replay = Replay(config.replay_episodes, sizes, config.replay_strata)
+        self.best: tuple[float, ...] | None = None
+        """Rank of the best block so far."""
+        self.best_is_now = False
+        """Whether that is the last one."""
         self.sampling = generator(config.seed, SAMPLING)
         exploration = generator(config.seed, EXPLORATION)
-        self.rollout = Rollout(self.env, self.policy, self._plan, config.seed, exploration)
+        self.rollout = Rollout(
+            *(self.env, self.policy, self._plan, config.seed, exploration), config.explore_hold
+        )
 
     @property
     def spec(self) -> EnvSpec:
@@ -176,7 +207,7 @@ class Session:
             self.policy.set_weights(self.learner.agent_weights())
 
     def _take(self, finished: Finished) -> None:
-        self.replay.add(finished.episode)
+        self.replay.add(finished.episode, finished.success)
         self.counters.episodes += 1
         self.coach.count(finished.plan)
         self.coach.advance(self.progress)
@@ -205,11 +236,21 @@ class Session:
             at_rate = {"strategy": "fixed", "crash_rate": self.coach.rate}
             crash = crash.model_copy(update=at_rate)
         block = self._play(Condition("block", crash), episodes)
+        victims = self._victims()
         if not self.config.test_crash_free:
-            return Block(block, None)
+            return Block(block, None, victims)
         if not any(episode.crashed for episode in block.episodes):
-            return Block(block, block)  # the same seeds: the same episodes
-        return Block(block, self._play(crash_free(), episodes))
+            return Block(block, block, victims)  # the same seeds: the same episodes
+        return Block(block, self._play(crash_free(), episodes), victims)
+
+    def _victims(self) -> tuple[Evaluation, ...]:
+        """Each robot alone crashed, in the coach's mode and for whole episodes."""
+        count, crash = self.config.test_victim_episodes, self.config.coach
+        episodes = range(self.counters.blocks * count, (self.counters.blocks + 1) * count)
+        return tuple(
+            self._play(named((robot,), crash.crash_mode, crash.crash_parameters), episodes)
+            for robot in (self.env.spec.robots if count else ())
+        )
 
     def _play(self, condition: Condition, episodes: range) -> Evaluation:
         seed = self.config.seed ^ _TEST_KEY
@@ -218,6 +259,9 @@ class Session:
     def end_block(self, block: Block) -> dict[str, Value]:
         """Tells the coach e_t; returns the block's line of metrics."""
         done, config = self.counters, self.config
+        self.best_is_now = self.best is None or block.rank >= self.best
+        if self.best_is_now:
+            self.best = block.rank
         record = self.coach.record_block(block.crashed.success_rate, self.progress)
         done.close_block(config.test_interval_steps)
         means = self.means.take(TRAIN_MEANS + LEARNER_MEANS)
@@ -237,6 +281,7 @@ class Session:
             "rollout": rollout_values,
             "sampling": dict(self.sampling.bit_generator.state),
             "means": self.means.state_dict(),
+            "best": self.best,
         }
         return tensors, values
 
@@ -256,4 +301,5 @@ class Session:
         self.coach.load_state_dict(values["coach"])
         self.sampling.bit_generator.state = values["sampling"]
         self.means.load_state_dict(values["means"])
+        self.best = None if values["best"] is None else tuple(map(float, values["best"]))
         self.counters = counters

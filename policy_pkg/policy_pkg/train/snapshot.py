@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from policy_pkg.checkpoint import (
+    BEST,
     CheckpointError,
     Manifest,
     read_manifest,
@@ -36,19 +37,36 @@ def save(out_dir: Path, session: Session | LiveSession, logged: Logged) -> Path:
     Raises:
         OSError: it could not be written; the older ones are untouched.
     """
-    spec, done = session.spec, session.counters
     tensors, values = session.state_dict()
-    manifest = Manifest(
+    folder = checkpoint_path(out_dir, session.counters.env_steps)
+    manifest = _manifest(session, {**values, "logged": vars(logged)})
+    write_checkpoint(folder, manifest, tensors, KEEP_LAST)
+    return folder
+
+
+def _manifest(session: Session | LiveSession, training: dict[str, Any]) -> Manifest:
+    spec = session.spec
+    return Manifest(
         scenario=session.config.scenario,
         robots=spec.robots,
         n_actions=spec.n_actions,
         obs_size=spec.obs_size,
         config=session.config.model_dump(mode="json"),
-        progress=done.to_json(),
-        training={**values, "logged": vars(logged)},
+        progress=session.counters.to_json(),
+        training=training,
     )
-    folder = checkpoint_path(out_dir, done.env_steps)
-    write_checkpoint(folder, manifest, tensors, KEEP_LAST)
+
+
+def save_best(out_dir: Path, session: Session) -> Path:
+    """Keeps the acting half of ``session`` as the run's best, over the one before.
+
+    Raises:
+        OSError: it could not be written; the one before is untouched.
+    """
+    folder = checkpoint_path(out_dir, session.counters.env_steps, BEST)
+    if not folder.exists():  # after a kill the same block is played again, with the same bits
+        manifest = _manifest(session, {})
+        write_checkpoint(folder, manifest, {"agent": session.learner.agent_weights()}, 1)
     return folder
 
 

@@ -20,7 +20,7 @@ from policy_pkg.train.metrics import Value
 from policy_pkg.train.run_dir import locked, prepare_run
 from policy_pkg.train.run_log import RunLog
 from policy_pkg.train.session import TEST_ARENAS, Session
-from policy_pkg.train.snapshot import Logged, restore, save
+from policy_pkg.train.snapshot import Logged, restore, save, save_best
 from sim_pkg.contract import BatchEnv, UserError
 from sim_pkg.env import make_env
 
@@ -164,9 +164,18 @@ class _Trainer:
             self._log.write(line, self._clock(), steps)
         except OSError as error:
             self._report("training", f"metrics at {steps} steps wait to be written: {error}")
+        if session.best_is_now:
+            self._save_best()
         due = steps - self._saved_steps
         if due and (due >= session.config.checkpoint_interval_steps or session.finished):
             self._save()
+
+    def _save_best(self) -> None:
+        try:
+            save_best(self._out_dir, self._session)
+        except OSError as error:
+            problem = f"the best checkpoint, at {self._session.counters.env_steps} steps,"
+            self._report("evaluation", f"{problem} was not written: {error}")
 
     def _save(self) -> None:
         session, steps = self._session, self._session.counters.env_steps
