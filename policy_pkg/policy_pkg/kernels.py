@@ -32,7 +32,7 @@ def _has_avx2() -> bool:
 
 
 def kernels() -> dict[str, str | None]:
-    """What the numpy in this process computes with: ``openblas``, None where it has another BLAS."""
+    """What numpy computes with in this process: ``openblas``, None where it has another BLAS."""
     import numpy  # noqa: F401 - so that its BLAS is loaded
     from threadpoolctl import threadpool_info
 

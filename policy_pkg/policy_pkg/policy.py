@@ -1,8 +1,9 @@
 """The agent network's forward pass in numpy: the one path that acts, in rollouts and on robots.
 
-Linear - ReLU - GRU - Linear, shared by all robots, as PyMARL's ``RNNAgent``. Rows are padded to a
-multiple of 8, because BLAS takes another path for very small batches: so a row's result does not
-depend, bit for bit, on how many rows are computed with it.
+Linear - ReLU - GRU - Linear, shared by all robots, as PyMARL's ``RNNAgent``. BLAS is handed eight
+rows at a time: how it sums depends on the number of rows and, with some of its kernels (Haswell's
+and Zen's), on a row's place among them, but not within eight. So a row's result does not depend,
+bit for bit, on how many rows are computed with it.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy.typing as npt
 
 from sim_pkg.contract import FloatArray, IntArray
 
-ROW_MULTIPLE = 8
+BLOCK_ROWS = 8
 WeightArrays = dict[str, npt.NDArray[np.float32]]
 
 WEIGHT_NAMES = (
@@ -160,21 +161,21 @@ class RecurrentPolicy:
         buf = self._scratch(rows)
         buf.obs[:rows] = obs
         buf.hidden[:rows] = hidden
-        x = np.dot(buf.obs, self._w_obs, out=buf.encoded)
+        x = _product(buf.obs, self._w_obs, buf.encoded)
         x[:rows] += self._action_rows[last_action]
         x[:rows] += self._robot_rows[robot]
         np.maximum(x, 0.0, out=x)
         h_next = self._gru(x, buf)
-        q = np.dot(h_next, self._w_out, out=buf.q)
+        q = _product(h_next, self._w_out, buf.q)
         q += self._b_out
         return q[:rows].copy(), h_next[:rows].copy()
 
     def _gru(self, x: FloatArray, buf: _Buffers) -> FloatArray:
         """torch.nn.GRUCell: r, z = sigmoid(..), n = tanh(W x + r (U h)), h' = n + z (h - n)."""
         h = self.sizes.hidden
-        gates = np.dot(x, self._w_ih, out=buf.gates_in)
+        gates = _product(x, self._w_ih, buf.gates_in)
         gates += self._b_ih
-        recurrent = np.dot(buf.hidden, self._w_hh, out=buf.gates_hidden)
+        recurrent = _product(buf.hidden, self._w_hh, buf.gates_hidden)
         recurrent += self._b_hh
         reset_update = gates[:, : 2 * h]
         reset_update += recurrent[:, : 2 * h]
@@ -194,7 +195,7 @@ class RecurrentPolicy:
         return buf.hidden
 
     def _scratch(self, rows: int) -> _Buffers:
-        padded = -(-rows // ROW_MULTIPLE) * ROW_MULTIPLE
+        padded = -(-rows // BLOCK_ROWS) * BLOCK_ROWS
         if padded not in self._buffers:
             h = self.sizes.hidden
             widths = (self.sizes.obs, h, h, 3 * h, 3 * h, self.sizes.actions)
@@ -216,3 +217,10 @@ class RecurrentPolicy:
             raise ValueError(
                 f"obs, last_action, robot, hidden have shapes {shapes}, expected {expected}"
             )
+
+
+def _product(rows: FloatArray, weight: FloatArray, out: FloatArray) -> FloatArray:
+    """out = rows @ weight, in blocks of BLOCK_ROWS, of which ``rows`` has a whole number."""
+    blocks = rows.reshape(-1, BLOCK_ROWS, rows.shape[1])
+    np.matmul(blocks, weight, out=out.reshape(len(blocks), BLOCK_ROWS, -1))
+    return out

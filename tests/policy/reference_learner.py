@@ -27,6 +27,7 @@ class Reference:
     double_q: bool = True
     drop_crashed: bool = False
     crashed_target: str = "max"
+    td_lambda: float = 0.0
 
 
 def random_episode(
@@ -133,7 +134,8 @@ def loss(
     errors: list[Tensor] = []
     for episode in episodes:
         q_online, q_target = values(online, episode), values(target, episode)
-        for t in range(episode.length):
+        later: list[Tensor] = []  # the next step's returns: of the team, for iql of each robot
+        for t in reversed(range(episode.length)):
             taken, following = [], []
             for robot in range(sizes.n_robots):
                 taken.append(q_online[t][robot][int(episode.actions[t, robot])])
@@ -149,14 +151,18 @@ def loss(
             ended = episode.terminated and t == episode.length - 1
             discount = 0.0 if ended else ref.gamma
             reward = float(episode.reward[t])
-            if ref.algorithm == "iql":
-                for robot in range(sizes.n_robots):
-                    if not (ref.drop_crashed and episode.faults[t, robot]):
-                        errors.append(reward + discount * following[robot] - taken[robot])
-            else:
-                after = mix(ref.algorithm, target, following, episode.state[t + 1]).detach()
-                before = mix(ref.algorithm, online, taken, episode.state[t])
-                errors.append(reward + discount * after - before)
+            if ref.algorithm != "iql":
+                following = [mix(ref.algorithm, target, following, episode.state[t + 1]).detach()]
+                taken = [mix(ref.algorithm, online, taken, episode.state[t])]
+            if later:
+                following = [
+                    (1 - ref.td_lambda) * value + ref.td_lambda * ahead
+                    for value, ahead in zip(following, later, strict=True)
+                ]
+            later = [reward + discount * value for value in following]
+            for robot, (target_value, value) in enumerate(zip(later, taken, strict=True)):
+                if not (ref.drop_crashed and episode.faults[t, robot]):
+                    errors.append(target_value - value)
     return torch.stack([error * error for error in errors]).mean()
 
 

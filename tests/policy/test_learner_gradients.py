@@ -57,6 +57,9 @@ def _learner(**settings: Any) -> Learner:
         ({"algorithm": "iql", "crashed_loss": "drop"}, Reference("iql", drop_crashed=True)),
         ({"algorithm": "qmix", "crashed_target": "mean"}, Reference("qmix", crashed_target="mean")),
         ({"algorithm": "vdn", "crashed_target": "stay"}, Reference("vdn", crashed_target="stay")),
+        ({"algorithm": "qmix", "td_lambda": 0.8}, Reference("qmix", td_lambda=0.8)),
+        ({"algorithm": "vdn", "td_lambda": 1.0}, Reference("vdn", td_lambda=1.0)),
+        ({"algorithm": "iql", "td_lambda": 0.5}, Reference("iql", td_lambda=0.5)),
     ],
     ids=lambda value: "-".join(map(str, value.values())) if isinstance(value, dict) else "",
 )
@@ -83,6 +86,18 @@ def test_loss_and_every_gradient_agree(
         np.testing.assert_allclose(
             gradients[name], grad, rtol=1e-6, atol=1e-12 * np.abs(grad).max(), err_msg=name
         )
+
+
+def test_a_lambda_return_of_one_is_the_discounted_sum_of_rewards() -> None:
+    """lambda = 1 on terminated episodes reads nothing of the target nets."""
+    rng = np.random.default_rng(8)
+    batch = _batch([random_episode(SIZES, rng, steps, terminated=True) for steps in (1, 4, 7)])
+    learner = _learner(algorithm="vdn", td_lambda=1.0)
+    before, _ = learner.loss_and_gradients(batch)
+    arrays, scalars = learner.state_dict()
+    other = {k: v + 1 if k.startswith("target.") else v for k, v in arrays.items()}
+    learner.load_state_dict(other, scalars)
+    assert learner.loss_and_gradients(batch)[0] == before
 
 
 def test_float32_gradients_are_those_of_float64() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from policy_pkg.act import epsilon_greedy, greedy
+from policy_pkg.act import Explorer, greedy
 from policy_pkg.policy import RecurrentPolicy
 from policy_pkg.train import agent_net
 from policy_pkg.train.episode import Episode, Sizes
@@ -194,7 +194,9 @@ def test_epsilon_greedy_explores_each_robot_on_its_own_and_only_the_available() 
     rows, epsilon = 60_000, 0.3
     q = np.tile(np.array([0, 1, 9, 2], dtype=np.float32), (rows, 1))
     available = np.tile(np.array([True, True, False, True]), (rows, 1))
-    actions = epsilon_greedy(q, available, epsilon, np.random.default_rng(4))
+    explorer = Explorer(rows, 1)
+    actions = explorer.choose(q[:, None], available[:, None], epsilon, np.random.default_rng(4))
+    actions = actions[:, 0]
     share = np.bincount(actions, minlength=4) / rows
     third = epsilon / 3
     np.testing.assert_allclose(share, [third, third, 0, 1 - epsilon + third], atol=0.01)
@@ -207,8 +209,9 @@ def test_epsilon_zero_is_greedy_and_one_is_uniform() -> None:
     q = rng.standard_normal((500, 4, 6)).astype(np.float32)
     available = rng.random((500, 4, 6)) < 0.5
     available[..., 0] = True
-    np.testing.assert_array_equal(epsilon_greedy(q, available, 0.0, rng), greedy(q, available))
-    explored = epsilon_greedy(q, available, 1.0, rng)
+    explorer = Explorer(500, 4)
+    np.testing.assert_array_equal(explorer.choose(q, available, 0.0, rng), greedy(q, available))
+    explored = explorer.choose(q, available, 1.0, rng)
     assert np.take_along_axis(available, explored[..., None], axis=-1).all()
 
 

@@ -162,7 +162,7 @@ def test_memory_follows_what_is_stored() -> None:
     sizes = Sizes(n_robots=8, n_actions=14, obs_size=128, state_size=216, episode_limit=60)
     before = _resident_bytes()
     replay = Replay(5000, sizes)
-    assert replay.nbytes_bound == 5000 * (61 * (4096 + 864 + 112) + 60 * 44 + 9)
+    assert replay.nbytes_bound == 5000 * (61 * (4096 + 864 + 112) + 60 * 44 + 18)
     assert _resident_bytes() - before < 8 * 2**20
     episode = random_episode(sizes, np.random.default_rng(0), 30, terminated=True)
     before = _resident_bytes()

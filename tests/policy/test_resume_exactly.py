@@ -12,7 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from policy_pkg.checkpoint import CheckpointError, find_checkpoint, read_manifest, read_tensors
+from policy_pkg.checkpoint import (
+    BEST,
+    CheckpointError,
+    find_checkpoint,
+    list_checkpoints,
+    read_manifest,
+    read_tensors,
+)
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.trainer import Phase, ProgressReport, train
 from sim_pkg.contract import UserError
@@ -121,6 +128,31 @@ def test_faults_with_memory_go_on_where_they_were(tmp_path: Path) -> None:
     assert 4 in replay["faults"]
 
 
+def test_every_setting_of_the_recipe_goes_on_where_it_was(tmp_path: Path) -> None:
+    """Random actions that are held, strata, lambda-returns, and the best so far."""
+    settings = {
+        **CONFIG.model_dump(),
+        "total_steps": 1600,
+        "explore_hold": 6,
+        "replay_strata": "outcome",
+        "test_victim_episodes": 1,
+        "learner": {**CONFIG.learner.model_dump(), "td_lambda": 0.8, "optimiser": "adam"},
+    }
+    config = TrainConfig.model_validate(settings)
+    train(config, tmp_path / "whole")
+    run = tmp_path / "run"
+    process = start(run, config)
+    wait_until_lines(run, 5, process)
+    os.kill(process.pid, signal.SIGKILL)
+    assert process.wait(timeout=30) == -signal.SIGKILL
+    assert read_manifest(find_checkpoint(run)).progress["env_steps"] < 1600
+    train(config, run, resume=True)
+    assert_same_run(run, tmp_path / "whole")
+    (mine,), (theirs,) = (list_checkpoints(folder / BEST) for folder in (run, tmp_path / "whole"))
+    assert mine.name == theirs.name
+    assert (mine / "agent.safetensors").read_bytes() == (theirs / "agent.safetensors").read_bytes()
+
+
 SCRIPT = """
 import sys
 from pathlib import Path
@@ -130,8 +162,8 @@ train(TrainConfig.model_validate_json(sys.argv[2]), Path(sys.argv[1]), resume=Tr
 """
 
 
-def start(run: Path) -> subprocess.Popen[bytes]:
-    return subprocess.Popen([sys.executable, "-c", SCRIPT, str(run), CONFIG.model_dump_json()])
+def start(run: Path, config: TrainConfig = CONFIG) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, "-c", SCRIPT, str(run), config.model_dump_json()])
 
 
 def wait_until_lines(run: Path, count: int, process: subprocess.Popen[bytes]) -> None:

@@ -73,7 +73,7 @@ class TrainConfig(BaseModel):
     test_victim_episodes: int = Field(
         0,
         ge=0,
-        description="greedy episodes per block and robot in which that robot alone crashes; 0: none",
+        description="greedy episodes per block and robot, in which it alone crashes; 0: none",
     )
     checkpoint_interval_steps: int = Field(
         100_000, ge=1, description="environment steps between two checkpoints, at block ends"

@@ -21,7 +21,7 @@ decision             what the coach did with e_t: raise, lower or keep
 new_alpha            nominal crash rate from here on
 success_crash_free   success rate of the same episodes without crashes (test_crash_free)
 return_crash_free    their mean return
-success_worst        success rate under the worst condition of the block: what ``best/`` is chosen by
+success_worst        success rate under the block's worst condition: ``best/`` goes by it
 success_R_crashed    success rate with robot R alone crashed (only with test_victim_episodes)
 train_success_rate   success rate of the training episodes since the last block, exploring
 train_return_mean    their mean return
