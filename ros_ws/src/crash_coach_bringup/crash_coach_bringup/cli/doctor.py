@@ -15,6 +15,7 @@ from typing import Annotated
 import typer
 
 from crash_coach_bringup.cli.output import check_json_target, console, table, write_json
+from policy_pkg.kernels import SAME_EVERYWHERE, kernels
 
 LIBRARIES = ("numpy", "numba", "pymunk", "torch", "safetensors", "pydantic", "matplotlib")
 FREE_BYTES = 10**9
@@ -50,6 +51,19 @@ def threads() -> Finding:
     value = os.environ.get("OMP_NUM_THREADS", "unset")
     hint = "" if value == "1" else "source env.sh: a second thread slows training down"
     return Finding("threads per process", value == "1", value, hint)
+
+
+def blas_kernels() -> Finding:
+    found = kernels()["openblas"]
+    hint = (
+        ""
+        if found == SAME_EVERYWHERE
+        else (
+            f"runs are the same on every machine with OPENBLAS_CORETYPE={SAME_EVERYWHERE}: source "
+            "env.sh (needs AVX2)"
+        )
+    )
+    return Finding("BLAS kernels", found == SAME_EVERYWHERE, found or "not OpenBLAS", hint)
 
 
 def library(name: str) -> Finding:
@@ -108,7 +122,7 @@ def dds() -> Finding:
 
 def examine() -> list[Finding]:
     """Every check; those that need ROS only where ROS was found."""
-    findings = [python_version(), compiler(), disk(), threads()]
+    findings = [python_version(), compiler(), disk(), threads(), blas_kernels()]
     findings += [library(name) for name in LIBRARIES]
     findings += [underlay(), interfaces()]
     need_ros: list[Callable[[], Finding]] = [executables, dds]
