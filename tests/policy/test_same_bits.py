@@ -51,7 +51,7 @@ def machine(**variables: str) -> dict[str, str]:
 
 def run(code: str, env: dict[str, str], *arguments: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", code, *arguments], env=env, capture_output=True, timeout=100
+        [sys.executable, "-c", code, *arguments], env=env, capture_output=True, timeout=800
     )
     assert done.returncode == 0, done.stderr.decode()
 
@@ -63,16 +63,22 @@ def disabled() -> str:
     return " ".join(name for name in NO_AVX512.split() if has.get(name) and name in dispatched)
 
 
-def test_training_has_the_same_bits_on_other_processors(tmp_path: Path) -> None:
-    """Every library forced to what it does on a machine with AVX2 and without AVX-512."""
+@pytest.mark.parametrize(
+    "numba",
+    [False, pytest.param(True, marks=(pytest.mark.soak, pytest.mark.timeout(900)))],
+    ids=["", "numba"],
+)
+def test_training_has_the_same_bits_on_other_processors(tmp_path: Path, numba: bool) -> None:
+    """Libraries forced to what they do on a machine with AVX2 and without AVX-512; numba's kernels
+    too in the soak test, since all of them are compiled anew for that."""
+    target = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CACHE_DIR": str(tmp_path / "numba")}
     config = small(explore_hold=6, replay_strata="outcome", learner={"td_lambda": 0.8}, n_envs=8)
     machines = {
         "this": machine(),
         "older": machine(
             NPY_DISABLE_CPU_FEATURES=disabled(),
             ATEN_CPU_CAPABILITY="avx2",
-            NUMBA_CPU_NAME="haswell",
-            NUMBA_CACHE_DIR=str(tmp_path / "numba"),
+            **(target if numba else {}),
         ),
     }
     found = {}

@@ -22,7 +22,6 @@ new_alpha            nominal crash rate from here on
 success_crash_free   success rate of the same episodes without crashes (test_crash_free)
 return_crash_free    their mean return
 success_worst        success rate under the block's worst condition: ``best/`` goes by it
-success_R_crashed    success rate with robot R alone crashed (only with test_victim_episodes)
 train_success_rate   success rate of the training episodes since the last block, exploring
 train_return_mean    their mean return
 train_steps_mean     their mean length, in control steps
@@ -33,6 +32,9 @@ q_taken_mean         mean value of the actions taken, likewise
 target_mean          mean TD target, likewise
 updates_per_episode  gradient steps per finished episode, as configured
 ===================  ==========================================================================
+
+With test_victim_episodes there is a key ``success_R_crashed`` for each robot R: the success rate with
+it alone crashed.
 
 ``timing.jsonl`` has one line per block as well: env_steps, wall_s (seconds since this process
 began training) and steps_per_s (environment steps per second since the last block, evaluation
