@@ -31,6 +31,29 @@ class TrajectoryHash:
         return self._sha.hexdigest()
 
 
+class CourseHash:
+    """Rolling hash of what happened in an episode, whatever its seed and number: equal for two
+    episodes that went alike. Of what the ROS graph publishes, so that both sides can tell it.
+    """
+
+    def __init__(self) -> None:
+        self._sha = hashlib.sha256()
+
+    def observe(self, state: FloatArray) -> None:
+        """Adds the global state before a step. state: (S,) float32."""
+        self._sha.update(state.tobytes())
+
+    def act(self, actions: IntArray, reward: float) -> None:
+        """Adds the executed actions, (n,) int32, and the reward."""
+        self._sha.update(actions.tobytes())
+        self._sha.update(struct.pack("<d", reward))
+
+    def finish(self, success: bool) -> str:
+        """Adds how it ended; the hash in hexadecimal digits."""
+        self._sha.update(struct.pack("<?", success))
+        return self._sha.hexdigest()
+
+
 def combine(digests: Iterable[str]) -> str:
     """One hash for many episodes, in the order given."""
     sha = hashlib.sha256()

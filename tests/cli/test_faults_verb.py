@@ -23,7 +23,8 @@ from crash_coach_pkg.fault_scenario import (
     find_fault_scenario,
     load_fault_scenario,
 )
-from policy_pkg.train.evaluate import crash_free, evaluate
+from policy_pkg.train.conditions import crash_free
+from policy_pkg.train.evaluate import evaluate
 from policy_pkg.train.verdict import FaultRun, judge_run
 from policy_pkg.untrained import write_untrained
 from sim_pkg.contract import UserError

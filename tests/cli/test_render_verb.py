@@ -19,7 +19,8 @@ from in_process import refused, typed
 from crash_coach_bringup.cli import calibrate
 from crash_coach_bringup.cli.main import main
 from crash_coach_bringup.ros.probe import find_executable
-from policy_pkg.train.evaluate import Scripted, evaluate, exactly, named, record
+from policy_pkg.train.conditions import exactly, named
+from policy_pkg.train.evaluate import Scripted, evaluate, record
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 from sim_pkg.frames import Frames

@@ -13,7 +13,7 @@ from crash_coach_bringup.cli.plot import style
 from crash_coach_bringup.cli.report import report
 from crash_coach_bringup.cli.report_curves import learning_curves
 from crash_coach_bringup.cli.report_figures import resilience
-from policy_pkg.train.evaluate import exactly
+from policy_pkg.train.conditions import exactly
 from policy_pkg.train.kept_evaluations import Evaluations
 from policy_pkg.train.report import rows
 from policy_pkg.train.results import find_runs, method_name, read_runs

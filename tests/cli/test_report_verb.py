@@ -122,14 +122,15 @@ def test_it_goes_on_where_it_was_left_and_repeats_every_digit(
 
 
 def test_a_single_seed_has_wilsons_interval(runs: Path, tmp_path: Path) -> None:
-    report([runs / "vdn-s0"], out=tmp_path, episodes=8, crashed=[0])
-    (row,) = results_of(tmp_path)["rows"]
+    report([runs / "vdn-s0"], out=tmp_path, episodes=8, crashed=[1, 0])
+    row, free = results_of(tmp_path)["rows"]
     assert row["iqm"] is None
+    assert (row["alike"], free["alike"], free["interval"]) == (False, True, None)
     assert row["interval"]["high"] - row["interval"]["low"] > 0.2
     text = (tmp_path / "table.md").read_text()
     assert "Wilson's interval over its episodes" in text
     assert "## Methods" not in text
-    assert not (tmp_path / "resilience.png").exists()
+    assert "they are one episode" in text
 
 
 def test_one_episode_per_run_counts_over_seeds(runs: Path, tmp_path: Path) -> None:

@@ -10,18 +10,9 @@ import pytest
 from crash_coach_pkg.config import CoachConfig
 from policy_pkg.checkpoint import CheckpointError, PolicyBundle
 from policy_pkg.policy import RecurrentPolicy
+from policy_pkg.train.conditions import Condition, at_rate, crash_free, exactly, named
 from policy_pkg.train.episode import Sizes
-from policy_pkg.train.evaluate import (
-    Condition,
-    Evaluation,
-    Scripted,
-    at_rate,
-    crash_free,
-    evaluate,
-    exactly,
-    named,
-    record,
-)
+from policy_pkg.train.evaluate import Evaluation, Scripted, evaluate, record
 from policy_pkg.train.learner import Learner
 from policy_pkg.train.learner_config import LearnerConfig
 from sim_pkg.config import ConfigError
@@ -134,6 +125,26 @@ def test_summary_counts(policy: RecurrentPolicy) -> None:
     low, high = summary["success_ci95"]
     assert low <= summary["success_rate"] <= high
     assert isinstance(run, Evaluation)
+
+
+def test_episodes_that_are_all_one_are_told(policy: RecurrentPolicy) -> None:
+    """On buttons nothing is drawn but victims and random commands."""
+    alike = {
+        condition.name: evaluate(policy, SCENARIO, condition, 6, 5).alike
+        for condition in (
+            *(crash_free(), named(["robot_1"]), exactly(2), at_rate(0.0), at_rate(1.0)),
+            *(named(["robot_2"], "random"), exactly(1), at_rate(1e-9)),
+        )
+    }
+    assert alike == {
+        "crash-free": True, "robot_1 mute": True, "2 crashed": True, "rate 0": True, "rate 1": True,
+        "robot_2 random": False, "1 crashed": False, "rate 1e-09": False,
+    }  # fmt: skip
+    run = evaluate(policy, SCENARIO, crash_free(), 6, 5)
+    assert len({e.trajectory_hash for e in run.episodes}) == 6  # these know seed and number
+    assert run.summary()["success_ci95"] is None
+    assert not evaluate(policy, SCENARIO, crash_free(), 1, 5).alike
+    assert not evaluate(Scripted("random"), SCENARIO, crash_free(), 6, 5).alike
 
 
 def test_a_policy_of_another_team_is_refused(policy: RecurrentPolicy) -> None:

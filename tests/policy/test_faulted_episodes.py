@@ -15,16 +15,9 @@ from crash_coach_pkg.effects import OBSERVED, WITHHELD, EffectRow
 from crash_coach_pkg.faults import mode_names
 from crash_coach_pkg.plan import CrashPlan, Fault, Trigger, TriggerKind
 from policy_pkg.policy import RecurrentPolicy
+from policy_pkg.train.conditions import Condition, Planned, crash_free, named
 from policy_pkg.train.episode import Sizes
-from policy_pkg.train.evaluate import (
-    Condition,
-    Evaluation,
-    Planned,
-    Scripted,
-    crash_free,
-    evaluate,
-    named,
-)
+from policy_pkg.train.evaluate import Evaluation, Scripted, evaluate
 from policy_pkg.train.learner import Learner
 from policy_pkg.train.learner_config import LearnerConfig
 from policy_pkg.train.rollout import Finished, Rollout, plan_from_json, plan_to_json

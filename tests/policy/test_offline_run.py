@@ -20,7 +20,8 @@ from offline_recordings import (
 from policy_pkg.checkpoint import CheckpointError, find_checkpoint, load_policy, read_manifest
 from policy_pkg.checkpoint import read_tensors as tensors_of
 from policy_pkg.train import offline
-from policy_pkg.train.evaluate import crash_free, evaluate
+from policy_pkg.train.conditions import crash_free
+from policy_pkg.train.evaluate import evaluate
 from policy_pkg.train.learner import Learner
 from policy_pkg.train.offline import OfflineReport, OfflineSummary, read_data
 from policy_pkg.train.offline_config import OfflineConfig

@@ -91,6 +91,8 @@ class FaultMode:
     """One line for the docs: what happens to which topic."""
     Parameters: ClassVar[type[FaultParameters]] = FaultParameters
     needs: ClassVar[frozenset[Need]] = frozenset()
+    draws: ClassVar[bool] = False
+    """Whether its effects hang on ``Step.bits``: then equal episodes are equal by chance only."""
 
     def __init__(self, parameters: Any) -> None:
         self.parameters = parameters

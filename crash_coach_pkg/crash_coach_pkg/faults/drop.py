@@ -36,6 +36,7 @@ class Drop(CommandFault[C]):
 
     name: ClassVar[str] = "drop"
     code: ClassVar[int] = 5
+    draws: ClassVar[bool] = True
     summary: ClassVar[str] = (
         "Commands get lost with a probability per step; in bursts where to_bad is above 0 "
         "(Gilbert-Elliott)."

@@ -26,6 +26,7 @@ class NoiseParameters(FaultParameters):
 class Noise(ObservationFault):
     name: ClassVar[str] = "noise"
     code: ClassVar[int] = 22
+    draws: ClassVar[bool] = True
     summary: ClassVar[str] = "Gaussian noise, new in each step, is added to every feature."
     Parameters: ClassVar[type[FaultParameters]] = NoiseParameters
 

@@ -12,6 +12,7 @@ _STREAM = 0  # the batched fast path (crash_coach_pkg.gate) draws from the same
 class Random(CommandFault[C]):
     name: ClassVar[str] = "random"
     code: ClassVar[int] = 2
+    draws: ClassVar[bool] = True
     summary: ClassVar[str] = (
         "A uniform command instead: an available action, or a velocity within the gate's limits."
     )

@@ -2,77 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from crash_coach_pkg.coach import Coach, Planner
-from crash_coach_pkg.config import CoachConfig, TeamSpec
+from crash_coach_pkg.config import TeamSpec
 from crash_coach_pkg.effects import EffectRow
 from crash_coach_pkg.faults import unmet_needs
 from policy_pkg.checkpoint import PolicyBundle
 from policy_pkg.policy import RecurrentPolicy
 from policy_pkg.train.arenas import ArenaArray, Arenas, Executed
+from policy_pkg.train.conditions import Condition, Planned
 from policy_pkg.train.statistics import wilson
 from policy_pkg.train.teams import RecurrentTeam, ScriptedTeam, Team, offers
 from sim_pkg.contract import BatchEnv, EnvSpec, UserError
 from sim_pkg.env import Env, make_env
 from sim_pkg.frames import Frames, Recorder
 from sim_pkg.scripted import make_scripted
-from sim_pkg.trajectory import TrajectoryHash, combine
-
-Parameters = Mapping[str, float]
-NO_PARAMETERS: Parameters = MappingProxyType({})
-
-
-@dataclass(frozen=True)
-class Condition:
-    """Under which crashes of a coach a policy is evaluated."""
-
-    name: str
-    crash: CoachConfig
-
-
-@dataclass(frozen=True)
-class Planned:
-    """Crashes that something else than a coach plans, such as a fault scenario.
-
-    ``planner``: for a team and the evaluation's seed; raises UserError where it cannot.
-    """
-
-    name: str
-    planner: Callable[[TeamSpec, int], Planner]
-
-
-def crash_free() -> Condition:
-    return Condition("crash-free", CoachConfig())
-
-
-def at_rate(rate: float, mode: str = "mute", parameters: Parameters = NO_PARAMETERS) -> Condition:
-    """Every robot crashes on its own with probability ``rate``; no re-sampling (the paper's)."""
-    who = {"crash_rate": rate, "resample": False}
-    return _fixed(f"rate {rate:g}", who, mode, parameters)
-
-
-def exactly(count: int, mode: str = "mute", parameters: Parameters = NO_PARAMETERS) -> Condition:
-    """``count`` uniformly drawn robots crash in every episode."""
-    return _fixed(f"{count} crashed", {"crashed_exactly": count}, mode, parameters)
-
-
-def named(
-    victims: Sequence[str], mode: str = "mute", parameters: Parameters = NO_PARAMETERS
-) -> Condition:
-    """These robots crash in every episode."""
-    return _fixed(f"{', '.join(victims)} {mode}", {"victims": tuple(victims)}, mode, parameters)
-
-
-def _fixed(name: str, who: dict[str, Any], mode: str, parameters: Parameters) -> Condition:
-    how = {"strategy": "fixed", "crash_mode": mode, "crash_parameters": dict(parameters)}
-    return Condition(name, CoachConfig.model_validate({**how, **who}))
+from sim_pkg.trajectory import CourseHash, TrajectoryHash, combine
 
 
 @dataclass(frozen=True)
@@ -85,12 +36,14 @@ class EpisodeResult:
     steps: int
     crashed: tuple[int, ...]  # indexes of the robots that were faulted in some step
     trajectory_hash: str
+    course_hash: str  # equal for episodes that went alike, see sim_pkg.trajectory
 
 
 @dataclass(frozen=True)
 class Evaluation:
     """All episodes of one condition, in episode order.
 
+    ``drawn``: as of the condition.
     ``effects``: sorted, if asked for: ACTIVE and CLEARED where a stretch of a fault begins and ends
     within its episode, EFFECT per robot-step with a command, or (OBSERVED) observation fault.
     """
@@ -100,6 +53,7 @@ class Evaluation:
     seed: int
     episodes: tuple[EpisodeResult, ...]
     effects: tuple[EffectRow, ...] = ()
+    drawn: bool = True
 
     @property
     def success_rate(self) -> float:
@@ -109,19 +63,31 @@ class Evaluation:
     def return_mean(self) -> float:
         return float(np.mean([e.episode_return for e in self.episodes]))
 
+    @property
+    def alike(self) -> bool:
+        """Whether the same episode was played again and again, with nothing left to chance.
+
+        It is then one episode, and no interval says anything about it.
+        """
+        courses = {e.course_hash for e in self.episodes}
+        left = self.drawn and not all(len(e.crashed) == len(self.robots) for e in self.episodes)
+        return len(self.episodes) > 1 and len(courses) == 1 and not left
+
     def summary(self) -> dict[str, Any]:
-        """JSON values. ``return_std`` is the sample's; ``crashed_fraction`` is per robot."""
+        """JSON values. ``return_std`` is the sample's; ``crashed_fraction`` is per robot;
+        ``success_ci95`` is null where the episodes are ``alike``."""
         returns = np.array([e.episode_return for e in self.episodes])
         interval = wilson(sum(e.success for e in self.episodes), len(self.episodes))
         crashed = sum(len(e.crashed) for e in self.episodes)
         return {
             "success_rate": self.success_rate,
-            "success_ci95": [interval.low, interval.high],
+            "success_ci95": None if self.alike else [interval.low, interval.high],
             "return_mean": self.return_mean,
             "return_std": float(returns.std(ddof=1)) if len(returns) > 1 else 0.0,
             "steps_mean": float(np.mean([e.steps for e in self.episodes])),
             "crashed_fraction": crashed / (len(self.episodes) * len(self.robots)),
             "episodes": len(self.episodes),
+            "alike": self.alike,
             "trajectory_hash": combine(e.trajectory_hash for e in self.episodes),
         }
 
@@ -219,6 +185,7 @@ class _Run:
         planner = _planner(condition, team, env.spec, seed)
         self._arenas = Arenas(env, team, planner.plan, seed, effects)
         self._hashes: dict[int, TrajectoryHash] = {}
+        self._courses: dict[int, CourseHash] = {}
         self._faulted = np.zeros((env.n_arenas, env.spec.n_robots), dtype=np.bool_)
         self._recorder = recorder
         self._recorders: dict[int, Recorder] = {}  # by arena, where a recorder was given
@@ -239,8 +206,14 @@ class _Run:
             free = self._arenas.count_step(done.result)
             results += [self._result(int(arena), done) for arena in free]
         results.sort(key=lambda result: result.episode)
-        name, robots, effects = self._condition.name, self._env.spec.robots, self._effects or ()
-        return Evaluation(name, robots, self._seed, tuple(results), tuple(sorted(effects)))
+        return Evaluation(
+            self._condition.name,
+            self._env.spec.robots,
+            self._seed,
+            tuple(results),
+            tuple(sorted(self._effects or ())),
+            self._condition.drawn,
+        )
 
     def _start(self, arenas: ArenaArray, waiting: list[int]) -> None:
         """Takes as many episodes off ``waiting`` as there are arenas for them."""
@@ -250,6 +223,7 @@ class _Run:
         self._faulted[arenas] = False
         for arena, episode in zip(arenas.tolist(), episodes, strict=True):
             self._hashes[arena] = TrajectoryHash(self._seed, episode)
+            self._courses[arena] = CourseHash()
             if self._recorder is not None:
                 self._recorders[arena] = self._recorder(arena, episode)
 
@@ -257,6 +231,7 @@ class _Run:
         obs, state = self._env.obs, self._env.state
         for arena in np.flatnonzero(self._arenas.running).tolist():
             self._hashes[arena].observe(obs[arena], state[arena])
+            self._courses[arena].observe(state[arena])
 
     def _account(self, done: Executed) -> None:
         result = done.result
@@ -270,6 +245,7 @@ class _Run:
                 bool(result.truncated[arena]),
                 bool(result.success[arena]),
             )
+            self._courses[arena].act(done.actions[arena], reward)
             if arena in self._recorders:
                 self._recorders[arena].step(done.modes[arena] != 0, reward)
 
@@ -285,6 +261,7 @@ class _Run:
             steps=int(self._arenas.steps[arena]),
             crashed=tuple(np.flatnonzero(self._faulted[arena]).tolist()),
             trajectory_hash=trajectory_hash,
+            course_hash=self._courses[arena].finish(success),
         )
 
 

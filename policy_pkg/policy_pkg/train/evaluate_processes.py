@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from policy_pkg.checkpoint import PolicyBundle
-from policy_pkg.train.evaluate import Condition, Evaluation, Scripted, evaluate
+from policy_pkg.train.conditions import Condition
+from policy_pkg.train.evaluate import Evaluation, Scripted, evaluate
 from sim_pkg.contract import UserError
 
 

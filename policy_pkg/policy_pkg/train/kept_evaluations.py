@@ -11,20 +11,25 @@ from pathlib import Path
 from typing import Any
 
 from policy_pkg.checkpoint import load_policy
-from policy_pkg.train.evaluate import Condition, evaluate
+from policy_pkg.train.conditions import Condition
+from policy_pkg.train.evaluate import evaluate
 from policy_pkg.train.results import Run
 from policy_pkg.train.run_dir import RunError
 from sim_pkg.env import make_env
 
-FORMAT = 1  # of what is kept; a new number makes everything be played again
+FORMAT = 2  # of what is kept; a new number makes everything be played again
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one run did under one condition; means are over its episodes."""
+    """What one run did under one condition; means are over its episodes.
+
+    ``alike``: the same episode again and again, see Evaluation.alike.
+    """
 
     successes: int
     episodes: int
+    alike: bool
     return_mean: float
     steps_mean: float
     trajectory_hash: str
@@ -32,6 +37,13 @@ class Outcome:
     @property
     def success(self) -> float:
         return self.successes / self.episodes
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Successes and episodes, of which those that are alike are one."""
+        return (
+            (self.successes // self.episodes, 1) if self.alike else (self.successes, self.episodes)
+        )
 
 
 @dataclass(frozen=True)
@@ -98,6 +110,7 @@ class Evaluations:
         return Outcome(
             successes=sum(episode.success for episode in found.episodes),
             episodes=len(found.episodes),
+            alike=found.alike,
             return_mean=figures["return_mean"],
             steps_mean=figures["steps_mean"],
             trajectory_hash=figures["trajectory_hash"],

@@ -26,6 +26,7 @@ from policy_pkg.train.session import (
     generator,
 )
 from sim_pkg.contract import EnvSpec, UserError
+from sim_pkg.trajectory import CourseHash
 
 
 class LiveSession:
@@ -187,6 +188,10 @@ def _victims(recorded: RecordedEpisode) -> set[int]:
 
 def _result(recorded: RecordedEpisode) -> EpisodeResult:
     episode = recorded.episode
+    course = CourseHash()
+    for step in range(episode.length):
+        course.observe(episode.state[step])
+        course.act(episode.actions[step], float(episode.reward[step]))
     return EpisodeResult(
         episode=recorded.number,
         success=recorded.success,
@@ -194,4 +199,5 @@ def _result(recorded: RecordedEpisode) -> EpisodeResult:
         steps=episode.length,
         crashed=tuple(int(robot) for robot in np.flatnonzero(episode.faults.any(axis=0))),
         trajectory_hash=recorded.trajectory_hash,
+        course_hash=course.finish(recorded.success),
     )

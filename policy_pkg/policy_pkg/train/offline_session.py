@@ -10,8 +10,9 @@ import numpy.typing as npt
 
 from policy_pkg.policy import RecurrentPolicy
 from policy_pkg.train.behaviour_cloning import Cloner
+from policy_pkg.train.conditions import Condition, crash_free, exactly
 from policy_pkg.train.crash_weights import CrashWeights, crash_weights
-from policy_pkg.train.evaluate import Condition, crash_free, evaluate_in, exactly
+from policy_pkg.train.evaluate import evaluate_in
 from policy_pkg.train.learner import Learner
 from policy_pkg.train.metrics import Means, Value
 from policy_pkg.train.offline_config import OfflineConfig

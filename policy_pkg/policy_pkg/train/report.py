@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
-from policy_pkg.train.evaluate import Condition
+from policy_pkg.train.conditions import Condition
 from policy_pkg.train.kept_evaluations import Result, arena
 from policy_pkg.train.results import methods_of
 from policy_pkg.train.statistics import (
@@ -34,10 +34,12 @@ class Row:
     ``success``, ``returns``: of each seed; of a row over all maps, success is each map's mean.
     ``interval``: 95 %, of the mean; Student's t over seeds, with one episode per run Wilson's
     over seeds; for a single seed Wilson's over its episodes (of the re-weighted estimate, its
-    own); None over all maps.
+    own); None over all maps, and for a single seed of a single episode: one that went alike each
+    time that it was played is one.
     ``iqm``: interquartile mean with stratified bootstrap; None for a single seed.
     ``not_measured``: probability of the numbers of crashed robots that a re-weighted estimate has
     no result for and counts as failures.
+    ``alike``: of every seed all episodes are the same one, with nothing left to chance.
     ``crashed``: exactly so many robots; None where the condition says something else.
     """
 
@@ -50,6 +52,7 @@ class Row:
     iqm: Estimate | None
     returns: tuple[float, ...] = ()
     not_measured: float = 0.0
+    alike: bool = False
     crashed: int | None = None
 
     @property
@@ -113,7 +116,8 @@ def rows(results: Sequence[Result], rates: Sequence[float]) -> list[Row]:
 def _measured(group: Sequence[Result], index: int) -> Row:
     condition = group[0].outcomes[index][0]
     outcomes = [result.outcomes[index][1] for result in group]
-    single = [wilson(outcome.successes, outcome.episodes) for outcome in outcomes]
+    counts = [outcome.counts for outcome in outcomes]
+    single = [wilson(*count) for count in counts]
     row = _row(
         group,
         condition.name,
@@ -121,10 +125,13 @@ def _measured(group: Sequence[Result], index: int) -> Row:
         returns=tuple(outcome.return_mean for outcome in outcomes),
         crashed=exactly_crashed(condition),
     )
-    if all(outcome.episodes == 1 for outcome in outcomes):
-        # Each seed is one success or failure: the counts have no normal distribution.
-        return replace(row, interval=wilson(sum(o.successes for o in outcomes), len(outcomes)))
-    return row
+    row = replace(row, alike=all(outcome.alike for outcome in outcomes))
+    if any(episodes > 1 for _, episodes in counts):
+        return row
+    if len(counts) == 1:
+        return replace(row, interval=None)
+    # Each seed is one success or failure: the counts have no normal distribution.
+    return replace(row, interval=wilson(sum(successes for successes, _ in counts), len(counts)))
 
 
 def _reweighted(group: Sequence[Result], rate: float) -> Row:
@@ -132,11 +139,13 @@ def _reweighted(group: Sequence[Result], rate: float) -> Row:
     single, missing = [], 0.0
     for result in group:
         exact = {
-            k: (outcome.successes, outcome.episodes)
+            k: outcome
             for condition, outcome in result.outcomes
             if (k := exactly_crashed(condition)) is not None
         }
-        single.append(reweighted_success(exact, n, rate))
+        counts = {k: (outcome.successes, outcome.episodes) for k, outcome in exact.items()}
+        known = frozenset(k for k, outcome in exact.items() if outcome.alike)
+        single.append(reweighted_success(counts, n, rate, known))
         weights = binomial_weights(n, rate)
         missing = sum(weight for k, weight in enumerate(weights) if k not in exact)
     return _row(group, f"rate {rate:g}, re-weighted", single, not_measured=missing)

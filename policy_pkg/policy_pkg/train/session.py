@@ -14,9 +14,10 @@ from crash_coach_pkg.faults import unmet_needs
 from crash_coach_pkg.plan import CrashPlan
 from crash_coach_pkg.strategies import Progress
 from policy_pkg.policy import RecurrentPolicy
+from policy_pkg.train.conditions import Condition, crash_free, named
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.episode import Sizes
-from policy_pkg.train.evaluate import Condition, Evaluation, crash_free, evaluate_in, named
+from policy_pkg.train.evaluate import Evaluation, evaluate_in
 from policy_pkg.train.learner import Learner
 from policy_pkg.train.metrics import Means, Value
 from policy_pkg.train.replay import Replay

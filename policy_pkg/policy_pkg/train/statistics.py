@@ -44,7 +44,11 @@ def binomial_weights(n: int, rate: float) -> list[float]:
 
 
 def reweighted_success(
-    exact: Mapping[int, tuple[int, int]], n: int, rate: float, confidence: float = 0.95
+    exact: Mapping[int, tuple[int, int]],
+    n: int,
+    rate: float,
+    known: frozenset[int] = frozenset(),
+    confidence: float = 0.95,
 ) -> Estimate:
     """Success rate at a crash rate from results with exactly k crashed robots.
 
@@ -56,6 +60,7 @@ def reweighted_success(
         exact: k -> (successes, episodes).
         n: robots of the team.
         rate: crash probability of each robot.
+        known: counts k whose rate is exact, because nothing in their episodes is left to chance.
 
     Raises:
         ValueError: a k outside 0..n, nothing measured, or a rate outside [0, 1].
@@ -70,6 +75,8 @@ def reweighted_success(
     for k, (successes, episodes) in exact.items():
         stratum = wilson(successes, episodes, confidence)
         value += weights[k] * stratum.value
+        if k in known:
+            continue
         below += (weights[k] * (stratum.value - stratum.low)) ** 2
         above += (weights[k] * (stratum.high - stratum.value)) ** 2
     unmeasured = sum(weight for k, weight in enumerate(weights) if k not in exact)

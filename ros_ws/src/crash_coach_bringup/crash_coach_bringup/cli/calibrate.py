@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,7 +25,8 @@ from crash_coach_bringup.cli.output import (
     table,
     write_json,
 )
-from policy_pkg.train.evaluate import Condition, Scripted, record
+from policy_pkg.train.conditions import Condition
+from policy_pkg.train.evaluate import Scripted, record
 from policy_pkg.train.statistics import wilson
 from sim_pkg.env import make_env
 from sim_pkg.frames import Frames, Side
@@ -44,6 +45,8 @@ class Tally:
     robots_lost: int = 0
     opponents_lost: int = 0
     episode_return: float = 0.0
+    courses: set[bytes] = field(default_factory=set)
+    drawn: bool = True  # whether the condition draws victims or effects
 
     def count(self, frames: Frames) -> None:
         dead = ~frames.alive[-1]
@@ -53,13 +56,17 @@ class Tally:
         self.robots_lost += int(dead[frames.indexes(Side.ROBOTS)].sum())
         self.opponents_lost += int(dead[frames.indexes(Side.OPPONENTS)].sum())
         self.episode_return += float(frames.returns[-1])
+        seen = (frames.positions_m, frames.angles_rad, frames.health, frames.returns)
+        self.courses.add(b"".join(array.tobytes() for array in seen))
 
     def figures(self) -> dict[str, Any]:
         """JSON values: win rate with its Wilson interval, mean length, who was lost on average."""
         interval = wilson(self.wins, self.episodes)
+        alike = len(self.courses) == 1 < self.episodes and not self.drawn
         return {
             "success_rate": self.wins / self.episodes,
-            "success_ci95": [interval.low, interval.high],
+            "success_ci95": None if alike else [interval.low, interval.high],
+            "alike": alike,
             "steps_mean": self.steps / self.episodes,
             "robots_lost_mean": self.robots_lost / self.episodes,
             "opponents_lost_mean": self.opponents_lost / self.episodes,
@@ -69,7 +76,7 @@ class Tally:
 
 def tally(policy: str, scenario: str, condition: Condition, episodes: int, seed: int) -> Tally:
     """Plays episodes 0 .. ``episodes`` - 1, at most AT_ONCE of them in memory."""
-    out = Tally()
+    out = Tally(drawn=condition.drawn)
     for first in range(0, episodes, AT_ONCE):
         some = range(first, min(first + AT_ONCE, episodes))
         for frames in record(Scripted(policy), scenario, condition, some, seed):

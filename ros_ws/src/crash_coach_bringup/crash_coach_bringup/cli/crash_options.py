@@ -9,7 +9,7 @@ import typer
 
 from crash_coach_bringup.cli.output import CliError
 from crash_coach_pkg.faults import check_parameters, fault_mode
-from policy_pkg.train.evaluate import Condition, at_rate, crash_free, exactly, named
+from policy_pkg.train.conditions import Condition, at_rate, crash_free, exactly, named
 from sim_pkg.contract import UserError
 
 CrashedOption = Annotated[

@@ -7,12 +7,13 @@ from typing import Annotated, Any
 
 import typer
 
-from crash_coach_bringup.cli.evaluate import Layout, as_json
+from crash_coach_bringup.cli.evaluate import ALIKE, Layout, as_json
 from crash_coach_bringup.cli.jobs import Job, run_jobs
 from crash_coach_bringup.cli.output import console, percent_ci, table, write_json
 from policy_pkg.checkpoint import load_policy
+from policy_pkg.train.conditions import Condition, crash_free, named
 from policy_pkg.train.config import load_train_config
-from policy_pkg.train.evaluate import Condition, Evaluation, crash_free, named
+from policy_pkg.train.evaluate import Evaluation
 
 METHODS = {"qmix": "buttons/demo_qmix", "adaptive": "buttons/demo_adaptive"}
 COLOURS = {"qmix": "tab:green", "adaptive": "tab:orange"}  # the paper's
@@ -74,6 +75,8 @@ def show(results: Results, episodes: int) -> None:
             )
         rows.add_section()
     console.print(rows)
+    if any(result.alike for evaluations in results.values() for _, result in evaluations):
+        console.print(ALIKE, soft_wrap=True)
 
 
 def summary(results: Results, out: Path, seed: int) -> dict[str, Any]:

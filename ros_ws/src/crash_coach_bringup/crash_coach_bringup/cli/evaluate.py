@@ -25,12 +25,14 @@ from crash_coach_bringup.cli.output import (
     write_json,
 )
 from crash_coach_bringup.cli.target import HELP, Target, load_target
-from policy_pkg.train.evaluate import Condition, Evaluation, Scripted
+from policy_pkg.train.conditions import Condition
+from policy_pkg.train.evaluate import Evaluation, Scripted
 from policy_pkg.train.evaluate_processes import evaluate_on
 from sim_pkg.trajectory import combine
 
 MOST_EPISODES = 1_000_000
 MOST_PROCESSES = 1024
+ALIKE = "1 episode: all went alike and nothing in them is left to chance, so there is no interval."
 
 
 class Via(StrEnum):
@@ -95,14 +97,17 @@ def show(title: str, results: list[tuple[Condition, Evaluation]]) -> None:
     rows = table(title, ["condition", "success (95 % interval)", "return", "steps", "crashed"])
     for condition, result in results:
         figures = result.summary()
+        spread = "" if result.alike else f" ± {figures['return_std']:.2f}"
         rows.add_row(
             condition.name,
             percent_ci(figures["success_rate"], figures["success_ci95"]),
-            f"{figures['return_mean']:.2f} ± {figures['return_std']:.2f}",
+            f"{figures['return_mean']:.2f}{spread}",
             f"{figures['steps_mean']:.1f}",
             f"{100 * figures['crashed_fraction']:.1f} %",
         )
     console.print(rows)
+    if any(result.alike for _, result in results):
+        console.print(ALIKE, soft_wrap=True)
 
 
 def as_json(results: list[tuple[Condition, Evaluation]]) -> list[dict[str, Any]]:

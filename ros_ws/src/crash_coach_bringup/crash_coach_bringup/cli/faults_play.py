@@ -10,7 +10,8 @@ from crash_coach_bringup.cli.target import Target
 from crash_coach_pkg.action_tools import ACTION_OFFERS
 from crash_coach_pkg.config import TeamSpec
 from crash_coach_pkg.fault_scenario import FaultScenario, ScenarioPlanner
-from policy_pkg.train.evaluate import Evaluation, Planned, Scripted, crash_free, evaluate
+from policy_pkg.train.conditions import Planned, crash_free
+from policy_pkg.train.evaluate import Evaluation, Scripted, evaluate
 from policy_pkg.train.verdict import FaultRun, judge_run
 from sim_pkg.contract import EnvSpec
 from sim_pkg.env import make_env

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +65,9 @@ def table(title: str, columns: list[str]) -> Table:
     return out
 
 
-def percent_ci(rate: float, interval: tuple[float, float] | list[float]) -> str:
-    """'87.5 % (79.0..93.1)'"""
+def percent_ci(rate: float, interval: Sequence[float] | None) -> str:
+    """'87.5 % (79.0..93.1)'; without an interval, of an episode that is always the same:
+    '0.0 % (1 episode)'"""
+    if interval is None:
+        return f"{100 * rate:.1f} % (1 episode)"
     return f"{100 * rate:.1f} % ({100 * interval[0]:.1f}..{100 * interval[1]:.1f})"

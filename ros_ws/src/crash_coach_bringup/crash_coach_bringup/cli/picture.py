@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from policy_pkg.checkpoint import PolicyBundle
-from policy_pkg.train.evaluate import Condition, Evaluation, record
+from policy_pkg.train.conditions import Condition
+from policy_pkg.train.evaluate import Evaluation, record
 from sim_pkg.render import Panel, Track, draw_trajectories
 
 

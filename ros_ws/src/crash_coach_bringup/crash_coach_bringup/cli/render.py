@@ -23,7 +23,8 @@ from crash_coach_bringup.cli.output import (
 )
 from crash_coach_bringup.cli.target import HELP, load_target
 from policy_pkg.bags.bag import holds_bags
-from policy_pkg.train.evaluate import Condition, record
+from policy_pkg.train.conditions import Condition
+from policy_pkg.train.evaluate import record
 from policy_pkg.train.playback import play_back, read_episode
 from sim_pkg.config import ConfigError
 from sim_pkg.frames import Frames

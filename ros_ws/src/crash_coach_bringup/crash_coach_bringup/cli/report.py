@@ -18,7 +18,7 @@ from crash_coach_bringup.cli.crash_options import (
 from crash_coach_bringup.cli.evaluate import MOST_EPISODES
 from crash_coach_bringup.cli.output import CliError, console, write_json
 from crash_coach_bringup.cli.report_page import page
-from policy_pkg.train.evaluate import Condition, crash_free, named
+from policy_pkg.train.conditions import Condition, crash_free, named
 from policy_pkg.train.kept_evaluations import Evaluations, Result, arena
 from policy_pkg.train.paired import paired_differences
 from policy_pkg.train.report import Row, exactly_crashed, improvements, rows

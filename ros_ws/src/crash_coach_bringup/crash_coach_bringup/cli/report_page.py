@@ -183,6 +183,11 @@ def notes(rows: Sequence[Row], runs: Sequence[Mapping[str, Any]]) -> list[str]:
                 f"{row.scenario}, {row.condition}: numbers of crashed robots that were not "
                 f"measured (probability {100 * row.not_measured:.1f} %) count as failures."
             )
+    if any(row.alike for row in rows):
+        out.append(
+            "Where all episodes of a run went alike and nothing in them is left to chance they are "
+            "one episode: a single seed then has no interval, several have Wilson's over seeds."
+        )
     if any(row.std == 0 for row in rows):
         out.append(
             "Where all seeds score alike, their interval has no width: that is no certainty."

@@ -10,7 +10,7 @@ import typer
 
 from crash_coach_bringup.cli.evaluate import Layout, LayoutOption
 from crash_coach_bringup.cli.output import CliError
-from policy_pkg.train.evaluate import at_rate, crash_free
+from policy_pkg.train.conditions import at_rate, crash_free
 
 if TYPE_CHECKING:
     from crash_coach_bringup.ros.supervisor import Event

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +17,7 @@ from crash_coach_pkg.effects import EffectKind, EffectRow
 from crash_coach_pkg.schedule import Schedule, World
 from policy_pkg.train.evaluate import EpisodeResult
 from sim_pkg.contract import UserError
+from sim_pkg.trajectory import CourseHash
 
 START_S = 60.0  # until the sim serves /sim/reset; a cold start compiles the book-keeping
 RETRY_S = 0.05
@@ -147,6 +149,7 @@ class Collector:
             steps=last.step,
             crashed=tuple(np.flatnonzero(crashed.any(axis=0)).tolist()),
             trajectory_hash=last.trajectory_hash,
+            course_hash=_course_hash(states),
         )
 
     def _check_crashed(self, states: list[EpisodeState], crashed: npt.NDArray[np.bool_]) -> None:
@@ -181,3 +184,12 @@ class Collector:
 
     def _names(self, mask: npt.NDArray[np.bool_]) -> str:
         return ", ".join(self._robots[i] for i in np.flatnonzero(mask)) or "nobody"
+
+
+def _course_hash(states: list[EpisodeState]) -> str:
+    """As policy_pkg.train.evaluate makes it, of all states of an episode."""
+    course = CourseHash()
+    for before, after in pairwise(states):
+        course.observe(np.asarray(before.state, dtype=np.float32))
+        course.act(np.asarray(after.actions, dtype=np.int32), after.reward)
+    return course.finish(states[-1].success)

@@ -24,7 +24,8 @@ from crash_coach_pkg.coach import Coach, Planner
 from crash_coach_pkg.config import CoachConfig, TeamSpec
 from crash_coach_pkg.fault_scenario import ScenarioPlanner, load_fault_scenario
 from crash_coach_pkg.faults import unmet_needs
-from policy_pkg.train.evaluate import Condition, Evaluation
+from policy_pkg.train.conditions import Condition
+from policy_pkg.train.evaluate import Evaluation
 from sim_pkg.contract import UserError
 
 
@@ -75,7 +76,8 @@ def evaluate_via_ros(
                 collector = Collector(client, planner, team.robots)
                 results = tuple(collector.play(episode) for episode in range(episodes))
                 effects = collector.effects()
-    return Evaluation(name, team.robots, seed, results, effects)
+    drawn = not isinstance(condition, Condition) or condition.drawn
+    return Evaluation(name, team.robots, seed, results, effects, drawn)
 
 
 def _planner(condition: Condition | Path, team: TeamSpec, seed: int) -> tuple[str, Planner]:
