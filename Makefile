@@ -7,7 +7,9 @@ IN_ENV := . ./env.sh &&
 PYTEST := PYTHONDONTWRITEBYTECODE= pytest
 # `make check` runs these, `make test` all others.
 CHECKED := tests/test_architecture.py tests/test_documents.py
-CODE := sim_pkg policy_pkg crash_coach_pkg ros_ws/src/crash_coach_bringup tests benchmarks scripts
+CODE := sim_pkg policy_pkg crash_coach_pkg ros_ws/src/crash_coach_bringup ros_ws/src/crash_coach_console tests benchmarks \
+    scripts
+PAGE := ros_ws/src/crash_coach_console/crash_coach_console/web
 
 .PHONY: help setup check test demo bench soak ray format lock clean
 
@@ -20,7 +22,9 @@ setup: ## .venv, pinned packages, built ROS workspace
 check: setup ## ruff, mypy, the architecture's laws, the documents' commands
 	$(IN_ENV) ruff format --check $(CODE) && ruff check $(CODE)
 	$(IN_ENV) mypy sim_pkg/sim_pkg policy_pkg/policy_pkg crash_coach_pkg/crash_coach_pkg \
-	    ros_ws/src/crash_coach_bringup/crash_coach_bringup scripts benchmarks
+	    ros_ws/src/crash_coach_bringup/crash_coach_bringup \
+	    ros_ws/src/crash_coach_console/crash_coach_console scripts benchmarks
+	$(IN_ENV) oxlint --quiet --deny-warnings $(PAGE)
 	$(IN_ENV) $(PYTEST) $(CHECKED)
 
 test: setup ## the test suite (but for what `make check` runs), under 5 minutes on 2 cores

@@ -19,6 +19,7 @@ PACKAGES = {
     "policy_pkg": ROOT / "policy_pkg/policy_pkg",
     "crash_coach_pkg": ROOT / "crash_coach_pkg/crash_coach_pkg",
     "crash_coach_bringup": BRINGUP,
+    "crash_coach_console": ROOT / "ros_ws/src/crash_coach_console/crash_coach_console",
 }
 PARAMETER_SERVICE = "sim_pkg.ros.parameter_service"
 FAULT_SCENARIO = PACKAGES["crash_coach_pkg"] / "fault_scenario.py"
@@ -74,6 +75,8 @@ def allowed(package: str, path: Path, name: str) -> bool:
         return True  # and so is what every node serves
     if package == "policy_pkg" and inside[0] == "train" and top != "crash_coach_bringup":
         return not within(name, f"{top}.ros")
+    if package == "crash_coach_console":  # shows all three; the command line starts it
+        return top != "crash_coach_bringup" and not within(name, f"{top}.ros")
     # `from sim_pkg import contract` reads as "sim_pkg" and "sim_pkg.contract".
     return package != "sim_pkg" and top == "sim_pkg" and within(name, "sim_pkg.contract")
 
@@ -109,6 +112,12 @@ def test_import_law() -> None:
         ("policy_pkg", "ros/node_params.py", "sim_pkg.ros.sim_params", False),
         ("policy_pkg", "agent.py", "sim_pkg.ros.parameter_service", False),
         ("policy_pkg", "policy.py", "yaml", False),
+        ("crash_coach_console", "team.py", "crash_coach_pkg.plan", True),
+        ("crash_coach_console", "team.py", "rclpy", False),
+        ("crash_coach_console", "ros/graph_link.py", "rclpy.node", True),
+        ("crash_coach_console", "ros/graph_link.py", "crash_coach_pkg.ros.run", False),
+        ("crash_coach_console", "command.py", "crash_coach_bringup.ros.client", False),
+        ("policy_pkg", "agent.py", "crash_coach_console.team", False),
     ],
 )
 def test_the_law_itself(package: str, inside: str, name: str, expected: bool) -> None:

@@ -118,17 +118,13 @@ class Recorder:
     def finish(self, success: bool, trajectory_hash: str) -> Frames:
         """What was gathered, when the episode has ended."""
         env, (seed, episode) = self._env, self._key
-        config, (width, height) = env.config, env.scene.arena_m
-        walled_m = (0.0, 0.0, width, height)
-        if isinstance(config, SkirmishConfig):
-            walled_m = config.free_m
         return Frames(
             scenario=env.spec.scenario,
             seed=seed,
             episode=episode,
             dt_s=env.spec.dt_s,
             scene=env.scene,
-            walled_m=walled_m,
+            walled_m=walled_m(env),
             actors=actors(env),
             positions_m=np.stack([positions for positions, _ in self._bodies]),
             angles_rad=np.stack([angles for _, angles in self._bodies]),
@@ -154,6 +150,14 @@ class Recorder:
         self._bodies.append((bodies[:, :2].astype(np.float32), turns[:, 0].astype(np.float32)))
         self._vitals.append(vitals(env, arena))
         self._sites_done.append(env.sites_done[arena].copy())
+
+
+def walled_m(env: Env) -> tuple[float, float, float, float]:
+    """x1, y1, x2, y2 of the part of the arena between its walls."""
+    if isinstance(env.config, SkirmishConfig):
+        return env.config.free_m
+    width, height = env.scene.arena_m
+    return (0.0, 0.0, width, height)
 
 
 def actors(env: Env) -> tuple[Actor, ...]:

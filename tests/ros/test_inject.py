@@ -168,7 +168,7 @@ def test_what_the_gate_cannot_do_is_refused_with_its_reason(untouched: Graph) ->
 
 
 def test_nobody_is_not_a_victim() -> None:
-    with pytest.raises(InjectError, match="name at least one robot"):
+    with pytest.raises(UserError, match="name at least one robot"):
         inject((), "mute")
 
 

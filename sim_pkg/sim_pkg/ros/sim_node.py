@@ -24,6 +24,7 @@ from sim_pkg.lockstep import Decisions
 from sim_pkg.pause import Pause
 from sim_pkg.realtime import NewestCommands
 from sim_pkg.ros import convert
+from sim_pkg.ros.arena_view import ArenaView
 from sim_pkg.ros.sim_lock import SecondSimError, only_sim
 from sim_pkg.ros.sim_params import read_parameters
 from sim_pkg.ros.sim_topics import SimTopics
@@ -61,7 +62,10 @@ class SimNode(Node):
         self._phase = _Phase.MATCHING
         self._pause = Pause(period_s, time.monotonic)
         self._robot_indexes = {name: i for i, name in enumerate(env.spec.robots)}
-        self._topics = SimTopics(self, env.spec, params.seed, self._on_command, self._on_event)
+        arena = ArenaView(self, env, self._lockstep, params.arena_hz, time.monotonic)
+        self._topics = SimTopics(
+            self, arena, env.spec, params.seed, self._on_command, self._on_event
+        )
         self.create_service(Trigger, "/sim/reset", self._on_reset)
         self.create_service(Trigger, "/sim/step", self._on_step)
         self.create_service(SetBool, "/sim/pause", self._on_pause)
@@ -215,6 +219,7 @@ class SimNode(Node):
         self._topics.refresh_listeners()
         decided = self._decisions if self._lockstep else self._newest
         self._topics.publish_diagnostics(decided, self._session)
+        self._topics.catch_up(self._session)
 
     # --- services ---------------------------------------------------------------------------
 

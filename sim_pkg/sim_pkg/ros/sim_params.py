@@ -43,6 +43,9 @@ class SimParameters(StrictModel):
     real_time_factor: float = Field(
         1.0, gt=0, le=1000, description="realtime: simulated seconds per second"
     )
+    arena_hz: float = Field(
+        30.0, gt=0, le=1000, description="most messages per second on /sim/arena_state"
+    )
 
 
 def read_parameters(node: Node) -> SimParameters:

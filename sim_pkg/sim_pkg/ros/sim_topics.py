@@ -19,6 +19,7 @@ from sim_pkg.contract import EnvSpec
 from sim_pkg.lockstep import Decisions
 from sim_pkg.realtime import NewestCommands
 from sim_pkg.ros import convert
+from sim_pkg.ros.arena_view import ArenaView
 from sim_pkg.session import Session
 
 EPISODE_TOPIC = "/sim/episode"
@@ -38,12 +39,14 @@ class SimTopics:
     def __init__(
         self,
         node: Node,
+        arena: ArenaView,
         spec: EnvSpec,
         seed: int,
         on_command: Callable[[int, bytes], None],
         on_event: Callable[[FaultEvent], None],
     ) -> None:
         self._node = node
+        self._arena = arena
         self._spec = spec
         self._period_ns = convert.step_period_ns(spec.dt_s)
         self._header = Header(frame_id=convert.MAP_FRAME)
@@ -77,6 +80,7 @@ class SimTopics:
     def refresh_listeners(self) -> None:
         """Notes who listens to what is built on demand only (odometry, markers)."""
         self._draw = self._markers_pub.get_subscription_count() > 0
+        self._arena.refresh_listeners()
         self._odom = [
             i for i, pub in enumerate(self._odom_pubs) if pub.get_subscription_count() > 0
         ]
@@ -110,10 +114,15 @@ class SimTopics:
             if session.running:
                 self._observations.fill(session)
                 self.publish_observations(range(self._spec.n_robots))
+        self._arena.look(session, self._header)
         if self._draw:
             self._markers_pub.publish(convert.markers(session, self._header))
         for robot in self._odom:
             self._odom_pubs[robot].publish(convert.odometry(session, self._header, robot))
+
+    def catch_up(self, session: Session) -> None:
+        """Shows viewers the newest state where it came too soon after the one before it."""
+        self._arena.catch_up(session, self._header)
 
     def publish_observations(self, robots: range | list[int]) -> None:
         """The current step's observations (once more) to some robots."""

@@ -28,6 +28,7 @@ from crash_coach_bringup.cli import (
     up,
 )
 from crash_coach_bringup.cli.several import expand
+from crash_coach_console.command import console
 from sim_pkg.contract import UserError
 
 app = typer.Typer(
@@ -48,6 +49,7 @@ app.command("profile")(profile.profile)
 app.add_typer(faults.app, name="faults")
 app.command("up")(up.up)
 app.command("inject")(inject.inject)
+app.command("console")(console)
 app.command("record")(record.record)
 app.add_typer(bags.app, name="bags")
 app.command("demo")(demo.demo)

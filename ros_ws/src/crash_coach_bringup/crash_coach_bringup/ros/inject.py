@@ -11,21 +11,11 @@ from rclpy.parameter_client import AsyncParameterClient
 from std_srvs.srv import Trigger
 
 from crash_coach_bringup.ros.client import GraphClient, graph_client
-from crash_coach_pkg.faults import check_parameters, fault_mode
-from crash_coach_pkg.parameters import NO_RETURN
+from crash_coach_pkg.faults import check_parameters
+from crash_coach_pkg.injection import describe, injection
 from sim_pkg.contract import UserError
 
 COACH = "/coach"
-NOBODY_ELSE = {
-    "strategy": "fixed",
-    "crashed_exactly": -1,
-    "victim_role": "",
-    "hazard_rate_hz": 0.0,
-    "near_radius_m": 0.0,
-    "return_above": NO_RETURN,
-}
-"""Ends every other way in which the coach was told to choose victims."""
-
 
 class InjectError(UserError):
     """Nothing was changed; the text is the reason."""
@@ -43,9 +33,7 @@ class InjectResult:
     parameters: dict[str, float] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        how = ", ".join(f"{name} {value:g}" for name, value in self.parameters.items())
-        mode = f"{self.mode} ({how})" if how else self.mode
-        return f"{', '.join(self.victims)}: {mode} from the {self.apply_at.replace('_', ' ')} on"
+        return describe(self.victims, self.mode, self.apply_at, self.parameters)
 
 
 def inject(
@@ -71,24 +59,16 @@ def inject(
         parameters: of the mode; what is missing has its default.
 
     Raises:
-        InjectError: no victims, or the coach refused, with its reason.
-        UserError: unknown mode, or parameters that it does not have.
+        InjectError: the coach refused, with its reason.
+        UserError: no victims, unknown mode, or parameters that it does not have.
         WaitError: no coach on this domain, or no answer.
     """
-    if not victims:
-        raise InjectError("name at least one robot to crash")
-    known = check_parameters(mode, parameters or {}).model_dump()
-    wanted = {
-        **NOBODY_ELSE,
-        **{f"{fault_mode(mode).name}.{name}": value for name, value in known.items()},
-        "enabled": True,
-        "victims": list(victims),
-        "crash_mode": mode,
-        "apply_at": apply_at,
-        "start_step": start_step,
-        "duration_steps": duration_steps,
-    }
-    settings = [Parameter(name, value=value) for name, value in wanted.items()]
+    given = parameters or {}
+    wanted = injection(victims, mode, apply_at, start_step, duration_steps, given)
+    settings = [
+        Parameter(name, value=list(value) if isinstance(value, tuple) else value)
+        for name, value in wanted.items()
+    ]
     with graph_client("crash_coach_inject", domain) as client:
         setter = AsyncParameterClient(client.node, COACH)
         client.greet(COACH, timeout_s, _no_coach(domain))
@@ -97,6 +77,7 @@ def inject(
         result = client.result(future, timeout_s, "the coach's answer").result
     if not result.successful:
         raise InjectError(f"the coach refused: {result.reason}")
+    known = check_parameters(mode, given).model_dump()
     return InjectResult(tuple(victims), mode, apply_at, start_step, duration_steps, known)
 
 

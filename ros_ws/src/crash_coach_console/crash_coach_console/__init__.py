@@ -1,0 +1,1 @@
+"""The live console: a team, a recording or a training run as a web page."""

@@ -1,0 +1,182 @@
+"""The page in a real browser, on real graphs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import pytest
+from conftest import WAIT_S, Teams
+from crash_coach_interfaces.msg import EpisodeState
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+PLACES = "crashCoach.stages[0].places().map((place) => [place.x, place.y])"
+MOVED = f"""(before) => {PLACES}.some(([x, y], i) =>
+    Math.hypot(x - before[i][0], y - before[i][1]) > 3)"""
+PHONE = {"width": 375, "height": 740}
+LATCHED = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+DESK = {"width": 1600, "height": 1000}
+
+
+@pytest.fixture
+def page(browser: Browser, teams: Teams) -> Iterator[Page]:
+    """On the first team, drawn; every fault of both is cleared afterwards."""
+    yield from opened(browser, teams, teams.one)
+
+
+@pytest.fixture
+def two(browser: Browser, teams: Teams) -> Iterator[Page]:
+    """On both teams."""
+    yield from opened(browser, teams, teams.both)
+
+
+def opened(browser: Browser, teams: Teams, address: str) -> Iterator[Page]:
+    made = browser.new_page(viewport=DESK)  # type: ignore[arg-type]
+    problems: list[str] = []
+    made.on("pageerror", lambda error: problems.append(str(error)))
+    made.on("console", lambda m: problems.append(m.text) if m.type == "error" else None)
+    made.set_default_timeout(1000 * WAIT_S)
+    made.goto(address)
+    made.wait_for_function(
+        "crashCoach.stages.length && crashCoach.stages.every("
+        "(stage) => stage.places().length > 0 && stage.status.ready)"
+    )
+    yield made
+    made.close()
+    teams.clear()
+    assert problems == []
+
+
+def select(page: Page, robot: str) -> None:
+    """A click on the robot where it is drawn now."""
+    at = page.evaluate(f"crashCoach.stages[0].places().find((place) => place.name === {robot!r})")
+    canvas = page.locator("canvas").first
+    canvas.click(position={"x": at["x"], "y": at["y"]})
+
+
+def crashed_at(teams: Teams, episode: int, step: int, team: int = 0) -> list[int]:
+    """Who was crashed in a control step that is still to come, or just was."""
+    found: list[list[int]] = []
+
+    def look(message: EpisodeState) -> None:
+        if (message.episode, message.step) == (episode, step + 1):
+            found.append(list(message.crashed))
+
+    client = teams.clients[team]
+    reader = client.node.create_subscription(EpisodeState, "/sim/episode", look, LATCHED)
+    client.until(lambda: bool(found), WAIT_S, f"step {step} of episode {episode}")
+    client.node.destroy_subscription(reader)
+    return found[0]
+
+
+def armed(answer: str) -> tuple[int, int]:
+    """(episode, step)"""
+    told = re.search(r"armed at step (\d+) of episode (\d+)", answer)
+    assert told is not None, answer
+    return int(told[2]), int(told[1])
+
+
+def test_robots_move_on_the_page(page: Page) -> None:
+    before = page.evaluate(PLACES)
+    assert len(before) == 2
+    page.wait_for_function(MOVED, arg=before)
+
+
+def test_a_click_mutes_a_robot_from_the_next_step_on_and_clear_all_clears(
+    page: Page, teams: Teams
+) -> None:
+    select(page, "robot_1")
+    page.get_by_role("button", name="Crash: mute").click()
+    page.locator("#answer[data-state=ok]").wait_for()
+    answer = page.locator("#answer").inner_text()
+    assert answer.startswith("robot_1: mute from the next step on")
+    assert crashed_at(teams, *armed(answer)) == [1, 0]
+    page.locator(".chip[data-state=faulted]", has_text="robot_1").wait_for()
+    page.locator(".events li", has_text="active").first.wait_for()
+    page.get_by_role("button", name="Clear all").click()
+    page.locator("#answer", has_text="every fault is cleared").wait_for()
+    page.locator(".chip[data-state=ok]", has_text="robot_1").wait_for()
+
+
+def test_keys_crash_two_robots_and_clear_one_of_them(page: Page, teams: Teams) -> None:
+    for key in ("1", "x"):
+        page.keyboard.press(key)
+    page.locator("#answer", has_text="robot_1: mute").wait_for()
+    for key in ("Escape", "2", "x"):
+        page.keyboard.press(key)
+    page.locator("#answer", has_text="robot_1, robot_2: mute").wait_for()
+    assert crashed_at(teams, *armed(page.locator("#answer").inner_text())) == [1, 1]
+    page.keyboard.press("c")
+    page.locator("#answer", has_text="robot_2: cleared; still crashed: robot_1").wait_for()
+
+
+def test_a_mode_with_its_parameters_from_the_next_episode(page: Page) -> None:
+    page.locator(".chip", has_text="robot_2").click()
+    page.select_option("#mode", "delay")
+    page.fill("#parameter-steps", "4")
+    page.get_by_label("the next episode").check()
+    page.fill("#start", "2")
+    page.fill("#duration", "3")
+    page.get_by_role("button", name="Crash: delay").click()
+    page.locator("#answer", has_text="robot_2: delay (steps 4) from the next episode on").wait_for()
+    page.locator(".coach dd", has_text="delay").wait_for()
+    page.fill("#parameter-steps", "-1")  # out of its range: the form keeps it
+    assert not page.evaluate("document.getElementById('faults').checkValidity()")
+
+
+def test_why_a_plan_is_refused_is_shown(page: Page) -> None:
+    page.locator(".chip", has_text="robot_1").click()
+    page.select_option("#mode", "blind")
+    page.get_by_role("button", name="Crash: blind").click()
+    answer = page.locator("#answer[data-state=bad]")
+    answer.wait_for()
+    assert re.search(r"refused: the gate refused: .*observations", answer.inner_text())
+    page.locator(".events li[data-kind=refused]", has_text="observations").first.wait_for()
+
+
+def test_two_teams_side_by_side_are_crashed_alike_or_one_alone(two: Page, teams: Teams) -> None:
+    left, right = two.locator(".stage").all()
+    boxes = [stage.bounding_box() for stage in (left, right)]
+    assert boxes[0] is not None
+    assert boxes[1] is not None
+    assert abs(boxes[0]["y"] - boxes[1]["y"]) < 2
+    assert boxes[0]["x"] + boxes[0]["width"] <= boxes[1]["x"]
+    two.keyboard.press("1")
+    two.keyboard.press("x")
+    for stage in (left, right):
+        stage.locator(".chip[data-state=faulted]", has_text="robot_1").wait_for()
+    two.keyboard.press("C")
+    for stage in (left, right):
+        stage.locator(".chip[data-state=ok]", has_text="robot_1").wait_for()
+    two.select_option("#team", "1")
+    two.keyboard.press("x")
+    two.locator("#answer", has_text="armed").wait_for()
+    right.locator(".chip[data-state=faulted]", has_text="robot_1").wait_for()
+    assert left.locator(".chip[data-state=faulted]").count() == 0
+
+
+@pytest.mark.parametrize("size", [PHONE, DESK], ids=["375px", "1600px"])
+def test_nothing_is_cut_off(page: Page, size: dict[str, int]) -> None:
+    page.set_viewport_size(size)  # type: ignore[arg-type]
+    assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
+    for name in ("Crash", "Clear all", "Pause"):
+        box = page.get_by_role("button", name=name, exact=True).bounding_box()
+        assert box is not None
+        assert box["x"] >= 0
+        assert box["x"] + box["width"] <= size["width"]
+    select(page, "robot_2")
+    page.locator(".chip[aria-pressed=true]", has_text="robot_2").wait_for()
+
+
+def test_every_control_has_a_name_for_readers_of_the_screen(page: Page) -> None:
+    unnamed = page.evaluate(
+        """[...document.querySelectorAll("button, input, select, canvas")].filter((element) =>
+            element.checkVisibility() && !element.textContent.trim() && !element.ariaLabel
+            && !element.getAttribute("aria-label") && !element.labels?.length)
+            .map((element) => element.outerHTML)"""
+    )
+    assert unnamed == []
