@@ -7,8 +7,8 @@ IN_ENV := . ./env.sh &&
 PYTEST := PYTHONDONTWRITEBYTECODE= pytest
 # `make check` runs these, `make test` all others.
 CHECKED := tests/test_architecture.py tests/test_documents.py
-CODE := sim_pkg policy_pkg crash_coach_pkg ros_ws/src/crash_coach_bringup ros_ws/src/crash_coach_console tests benchmarks \
-    scripts
+CODE := sim_pkg policy_pkg crash_coach_pkg ros_ws/src/crash_coach_common ros_ws/src/crash_coach_bringup \
+    ros_ws/src/crash_coach_console tests benchmarks scripts
 PAGE := ros_ws/src/crash_coach_console/crash_coach_console/web
 
 .PHONY: help setup check test demo bench soak ray format lock clean
@@ -22,6 +22,7 @@ setup: ## .venv, pinned packages, built ROS workspace
 check: setup ## ruff, mypy, the architecture's laws, the documents' commands
 	$(IN_ENV) ruff format --check $(CODE) && ruff check $(CODE)
 	$(IN_ENV) mypy sim_pkg/sim_pkg policy_pkg/policy_pkg crash_coach_pkg/crash_coach_pkg \
+	    ros_ws/src/crash_coach_common/crash_coach_common \
 	    ros_ws/src/crash_coach_bringup/crash_coach_bringup \
 	    ros_ws/src/crash_coach_console/crash_coach_console scripts benchmarks
 	$(IN_ENV) oxlint --quiet --deny-warnings $(PAGE)

@@ -30,10 +30,10 @@ from crash_coach_bringup.ros.domain import reserve_domain
 from crash_coach_bringup.ros.graph import Process, graph_environment, ros_arguments
 from crash_coach_bringup.ros.supervisor import Supervisor
 from policy_pkg.bags.about import About
+from policy_pkg.bags.dataset import load_episodes
 from policy_pkg.bags.topics import OF_ROBOT, Kind, connections, load_typestore
 from policy_pkg.bags.writer import BagWriter, Split
 from policy_pkg.ros.recorder_node import PROFILE, PROFILE_VARIABLE
-from policy_pkg.train.bag_dataset import load_episodes
 from sim_pkg.env import make_env
 from sim_pkg.ros.convert import EpisodeWriter, ObservationWriter
 from sim_pkg.session import Session

@@ -16,10 +16,10 @@ import numpy as np
 import torch
 
 from benchmarks.padded_learner import PaddedLearner, PaddedReplay
-from policy_pkg.train.episode import Episode, Sizes
-from policy_pkg.train.learner import Learner
-from policy_pkg.train.learner_config import LearnerConfig
-from policy_pkg.train.replay import Replay
+from policy_pkg.episode import Episode, Sizes
+from policy_pkg.learner.config import LearnerConfig
+from policy_pkg.learner.learner import Learner
+from policy_pkg.learner.replay import Replay
 
 COMBAT = Sizes(n_robots=8, n_actions=14, obs_size=128, state_size=216, episode_limit=60)
 BUTTONS = Sizes(n_robots=2, n_actions=5, obs_size=2, state_size=8, episode_limit=20)

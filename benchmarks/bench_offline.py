@@ -21,11 +21,11 @@ from benchmarks.bench_learner import (
     STORED_EPISODES,
     random_episode,
 )
-from policy_pkg.train.behaviour_cloning import Cloner
-from policy_pkg.train.episode import Sizes
-from policy_pkg.train.learner import Learner
-from policy_pkg.train.learner_config import LearnerConfig
-from policy_pkg.train.replay import Replay
+from policy_pkg.episode import Sizes
+from policy_pkg.learner.cloner import Cloner
+from policy_pkg.learner.config import LearnerConfig
+from policy_pkg.learner.learner import Learner
+from policy_pkg.learner.replay import Replay
 
 WARM_UP = 2
 LEAST_RATIO = 0.8  # of the conservative term: it shares the forward pass

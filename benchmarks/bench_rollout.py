@@ -16,18 +16,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from crash_coach_pkg.coach import Coach
-from crash_coach_pkg.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.coach import Coach
+from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from policy_pkg.episode import Sizes
+from policy_pkg.learner.config import LearnerConfig
+from policy_pkg.learner.learner import Learner
+from policy_pkg.learner.replay import Replay
+from policy_pkg.play.rollout import Rollout
 from policy_pkg.policy import RecurrentPolicy
 from policy_pkg.train.config import TrainConfig
-from policy_pkg.train.episode import Sizes
-from policy_pkg.train.learner import Learner
-from policy_pkg.train.learner_config import LearnerConfig
-from policy_pkg.train.replay import Replay
-from policy_pkg.train.rollout import Rollout
 from policy_pkg.train.session import Session
-from sim_pkg.config import find_scenario
 from sim_pkg.env import make_env
+from sim_pkg.scenario_files import find_scenario
 
 ARENAS = 32
 EPSILON = 0.5

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from policy_pkg.train.episode import Episode, Sizes
+from policy_pkg.episode import Episode, Sizes
 
 
 class PaddedAgent(nn.Module):

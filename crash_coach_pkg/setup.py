@@ -9,7 +9,13 @@ setup(
     maintainer="Crash Coach engineers",
     maintainer_email="team@crash-coach.dev",
     license="Apache-2.0",
-    packages=["crash_coach_pkg", "crash_coach_pkg.faults", "crash_coach_pkg.ros"],
+    packages=[
+        "crash_coach_pkg",
+        "crash_coach_pkg.coach",
+        "crash_coach_pkg.faults",
+        "crash_coach_pkg.gate",
+        "crash_coach_pkg.ros",
+    ],
     package_data={"crash_coach_pkg": ["configs/**/*.yaml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),

@@ -9,7 +9,14 @@ setup(
     maintainer="Crash Coach engineers",
     maintainer_email="team@crash-coach.dev",
     license="Apache-2.0",
-    packages=["sim_pkg", "sim_pkg.ros", "sim_pkg.scenarios", "sim_pkg.scripted"],
+    packages=[
+        "sim_pkg",
+        "sim_pkg.render",
+        "sim_pkg.ros",
+        "sim_pkg.scenarios",
+        "sim_pkg.scenarios.skirmish",
+        "sim_pkg.scripted",
+    ],
     package_data={"sim_pkg": ["configs/**/*.yaml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),

@@ -14,15 +14,17 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 BRINGUP = ROOT / "ros_ws/src/crash_coach_bringup/crash_coach_bringup"
+COMMON = ROOT / "ros_ws/src/crash_coach_common/crash_coach_common"
 PACKAGES = {
+    "crash_coach_common": COMMON,
     "sim_pkg": ROOT / "sim_pkg/sim_pkg",
     "policy_pkg": ROOT / "policy_pkg/policy_pkg",
     "crash_coach_pkg": ROOT / "crash_coach_pkg/crash_coach_pkg",
     "crash_coach_bringup": BRINGUP,
     "crash_coach_console": ROOT / "ros_ws/src/crash_coach_console/crash_coach_console",
 }
-PARAMETER_SERVICE = "sim_pkg.ros.parameter_service"
-FAULT_SCENARIO = PACKAGES["crash_coach_pkg"] / "fault_scenario.py"
+# The rooms of policy_pkg that put simulator, coach and policies together.
+JOINING = {"bags", "play", "report", "sweep", "train"}
 MESSAGES = {
     "rclpy", "crash_coach_interfaces", "std_msgs", "geometry_msgs", "nav_msgs", "std_srvs",
     "visualization_msgs", "diagnostic_msgs", "rosgraph_msgs", "rcl_interfaces",
@@ -64,21 +66,18 @@ def allowed(package: str, path: Path, name: str) -> bool:
     if top == "pymunk":
         return path == PACKAGES["sim_pkg"] / "world.py"
     if top == "torch":
-        return package == "policy_pkg" and inside[0] == "train"
+        return package == "policy_pkg" and inside[0] in {"learner", "train"}
     if top == "yaml":
-        return path.name == "config.py"
+        return path == COMMON / "strict_yaml.py"
     if top not in PACKAGES or top == package or package == "crash_coach_bringup":
         return True
-    if within(name, "sim_pkg.config") and path == FAULT_SCENARIO:
-        return True  # strict YAML is written once
-    if within(name, PARAMETER_SERVICE) and "ros" in inside[:-1]:
-        return True  # and so is what every node serves
-    if package == "policy_pkg" and inside[0] == "train" and top != "crash_coach_bringup":
-        return not within(name, f"{top}.ros")
+    if top == "crash_coach_common":
+        return "ros" in inside[:-1] or not within(name, f"{top}.ros")
+    if within(name, f"{top}.ros"):
+        return False
     if package == "crash_coach_console":  # shows all three; the command line starts it
-        return top != "crash_coach_bringup" and not within(name, f"{top}.ros")
-    # `from sim_pkg import contract` reads as "sim_pkg" and "sim_pkg.contract".
-    return package != "sim_pkg" and top == "sim_pkg" and within(name, "sim_pkg.contract")
+        return top != "crash_coach_bringup"
+    return package == "policy_pkg" and inside[0] in JOINING and top != "crash_coach_bringup"
 
 
 def test_import_law() -> None:
@@ -95,27 +94,34 @@ def test_import_law() -> None:
     ("package", "inside", "name", "expected"),
     [
         ("sim_pkg", "env.py", "policy_pkg.act", False),
+        ("sim_pkg", "env.py", "crash_coach_pkg.plan", False),
+        ("sim_pkg", "env.py", "crash_coach_common.contract", True),
+        ("sim_pkg", "env.py", "crash_coach_common.ros.run_node", False),
         ("sim_pkg", "env.py", "pymunk", False),
         ("sim_pkg", "world.py", "pymunk", True),
         ("sim_pkg", "env.py", "rclpy", False),
         ("sim_pkg", "ros/sim_node.py", "rclpy.node", True),
-        ("crash_coach_pkg", "gate.py", "sim_pkg.contract", True),
-        ("crash_coach_pkg", "gate.py", "sim_pkg.env", False),
-        ("crash_coach_pkg", "gate.py", "sim_pkg.config", False),
-        ("crash_coach_pkg", "fault_scenario.py", "sim_pkg.config", True),
+        ("sim_pkg", "ros/sim_node.py", "crash_coach_common.ros.run_node", True),
+        ("crash_coach_common", "contract.py", "sim_pkg.env", False),
+        ("crash_coach_common", "strict_yaml.py", "yaml", True),
+        ("crash_coach_pkg", "gate/action_gate.py", "crash_coach_common.contract", True),
+        ("crash_coach_pkg", "gate/action_gate.py", "sim_pkg.env", False),
+        ("crash_coach_pkg", "coach/fault_scenario.py", "crash_coach_common.strict_yaml", True),
         ("policy_pkg", "policy.py", "torch", False),
-        ("policy_pkg", "train/learner.py", "torch.nn", True),
-        ("policy_pkg", "train/rollout.py", "crash_coach_pkg.coach", True),
-        ("policy_pkg", "train/rollout.py", "crash_coach_pkg.ros.gate_node", False),
-        ("policy_pkg", "ros/policy_node.py", "crash_coach_pkg.gate", False),
-        ("policy_pkg", "ros/node_params.py", "sim_pkg.ros.parameter_service", True),
+        ("policy_pkg", "learner/learner.py", "torch.nn", True),
+        ("policy_pkg", "learner/learner.py", "crash_coach_pkg.plan", False),
+        ("policy_pkg", "play/rollout.py", "torch", False),
+        ("policy_pkg", "play/rollout.py", "crash_coach_pkg.coach.coach", True),
+        ("policy_pkg", "play/rollout.py", "crash_coach_pkg.ros.gate_node", False),
+        ("policy_pkg", "ros/policy_node.py", "crash_coach_pkg.gate.action_gate", False),
+        ("policy_pkg", "ros/policy_node.py", "crash_coach_common.ros.parameters", True),
         ("policy_pkg", "ros/node_params.py", "sim_pkg.ros.sim_params", False),
-        ("policy_pkg", "agent.py", "sim_pkg.ros.parameter_service", False),
+        ("policy_pkg", "agent.py", "crash_coach_common.ros.parameters", False),
         ("policy_pkg", "policy.py", "yaml", False),
         ("crash_coach_console", "team.py", "crash_coach_pkg.plan", True),
         ("crash_coach_console", "team.py", "rclpy", False),
         ("crash_coach_console", "ros/graph_link.py", "rclpy.node", True),
-        ("crash_coach_console", "ros/graph_link.py", "crash_coach_pkg.ros.run", False),
+        ("crash_coach_console", "ros/graph_link.py", "crash_coach_pkg.ros.gate_node", False),
         ("crash_coach_console", "command.py", "crash_coach_bringup.ros.client", False),
         ("policy_pkg", "agent.py", "crash_coach_console.team", False),
     ],
@@ -126,8 +132,8 @@ def test_the_law_itself(package: str, inside: str, name: str, expected: bool) ->
 
 def test_acting_and_evaluating_do_not_load_torch() -> None:
     code = (
-        "import sys, policy_pkg.policy, policy_pkg.checkpoint, policy_pkg.train.evaluate, "
-        "policy_pkg.train.rollout, policy_pkg.train.config; sys.exit('torch' in sys.modules)"
+        "import sys, policy_pkg.policy, policy_pkg.checkpoint, policy_pkg.play.evaluate, "
+        "policy_pkg.play.rollout, policy_pkg.train.config; sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
 

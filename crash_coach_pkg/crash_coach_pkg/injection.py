@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from crash_coach_common.contract import UserError
+from crash_coach_pkg.coach.parameters import NO_RETURN, Value
 from crash_coach_pkg.faults import check_parameters, fault_mode
-from crash_coach_pkg.parameters import NO_RETURN, Value
-from sim_pkg.contract import UserError
 
 NOBODY_ELSE: Mapping[str, Value] = {
     "strategy": "fixed",

@@ -5,9 +5,9 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import NamedTuple
 
-from crash_coach_pkg.bits import random_bits
+from crash_coach_common.contract import FloatArray
+from crash_coach_common.keyed_random import random_bits
 from crash_coach_pkg.plan import CrashPlan, Fault, TriggerKind
-from sim_pkg.contract import FloatArray
 
 _HAZARD_STREAM = 1000  # + the fault's place in the plan
 _NEVER = -1

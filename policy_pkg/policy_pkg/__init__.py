@@ -1,4 +1,4 @@
-"""Decentralised QMIX agents: acting (numpy), training (torch, under train/), and ROS 2 nodes."""
+"""Decentralised QMIX agents: acting (numpy), training (torch, under learner/), and ROS 2 nodes."""
 
 from policy_pkg.kernels import pin_kernels
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sim_pkg.contract import BoolArray, FloatArray, IntArray
+from crash_coach_common.contract import BoolArray, FloatArray, IntArray
 
 _EXPLORATION = 0xE8910  # keeps these draws apart from the environment's of the same seed
 

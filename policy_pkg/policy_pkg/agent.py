@@ -13,7 +13,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from sim_pkg.contract import BoolArray, FloatArray, IntArray, UserError
+from crash_coach_common.contract import BoolArray, FloatArray, IntArray, UserError
 
 Stamp = TypeVar("Stamp")
 UInt8Array = npt.NDArray[np.uint8]

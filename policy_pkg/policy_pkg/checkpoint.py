@@ -21,8 +21,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
+from crash_coach_common.contract import EnvSpec, UserError
 from policy_pkg.policy import RecurrentPolicy
-from sim_pkg.contract import EnvSpec, UserError
 
 FORMAT = "crash-coach-checkpoint"
 VERSION = 1

@@ -9,10 +9,10 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load
 
+from crash_coach_common.contract import UserError
 from policy_pkg.act import Exploration, greedy, least_valued
 from policy_pkg.agent import Agent
 from policy_pkg.policy import RecurrentPolicy, WeightArrays, check_weights
-from sim_pkg.contract import UserError
 
 Stamp = TypeVar("Stamp")
 

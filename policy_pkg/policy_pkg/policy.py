@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sim_pkg.contract import FloatArray, IntArray
+from crash_coach_common.contract import FloatArray, IntArray
 
 BLOCK_ROWS = 8
 WeightArrays = dict[str, npt.NDArray[np.float32]]

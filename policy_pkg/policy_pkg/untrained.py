@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from crash_coach_common.contract import EnvSpec
 from policy_pkg.checkpoint import Manifest, write_checkpoint
 from policy_pkg.policy import weight_shapes
-from sim_pkg.contract import EnvSpec
 
 SCALE = 0.3  # wide enough that the action depends on observation and memory
 

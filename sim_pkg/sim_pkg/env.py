@@ -8,16 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from sim_pkg.config import (
-    ConfigError,
-    StrictModel,
-    did_you_mean,
-    find_scenario,
-    load_tree,
-    scenario_names,
-    validate,
-)
-from sim_pkg.contract import (
+from crash_coach_common.contract import (
     BoolArray,
     EnvSpec,
     EpisodeArray,
@@ -25,8 +16,17 @@ from sim_pkg.contract import (
     IntArray,
     StepResult,
 )
-from sim_pkg.scenarios import buttons, coverage, skirmish, transport
+from crash_coach_common.strict_yaml import (
+    ConfigError,
+    StrictModel,
+    did_you_mean,
+    load_tree,
+    validate,
+)
+from sim_pkg.scenario_files import find_scenario, scenario_names
+from sim_pkg.scenarios import buttons, coverage, transport
 from sim_pkg.scenarios.base import Buffers, Kind, Scenario, Scene
+from sim_pkg.scenarios.skirmish import rules as skirmish
 from sim_pkg.world import Float64Array, World
 
 __all__ = ["KINDS", "Env", "make_env", "scenario_names"]

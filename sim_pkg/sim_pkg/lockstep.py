@@ -6,7 +6,7 @@ from enum import Enum
 
 import numpy as np
 
-from sim_pkg.contract import BoolArray, IntArray
+from crash_coach_common.contract import BoolArray, IntArray
 
 _FAULT_NONE = 0
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from sim_pkg.contract import FloatArray
+from crash_coach_common.contract import FloatArray
 from sim_pkg.env import make_env
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim_pkg.contract import BoolArray, IntArray
+from crash_coach_common.contract import BoolArray, IntArray
 from sim_pkg.lockstep import Health, unavailable
 
 _NEVER_S = float("-inf")

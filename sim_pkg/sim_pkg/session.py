@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from sim_pkg.contract import BoolArray, FloatArray, IntArray, stay_action
+from crash_coach_common.contract import BoolArray, FloatArray, IntArray, stay_action
 from sim_pkg.env import Env
 from sim_pkg.trajectory import TrajectoryHash
 

@@ -6,7 +6,7 @@ import hashlib
 import struct
 from collections.abc import Iterable
 
-from sim_pkg.contract import FloatArray, IntArray
+from crash_coach_common.contract import FloatArray, IntArray
 
 
 class TrajectoryHash:

@@ -14,7 +14,7 @@ from policy_pkg.bags.about import About
 from policy_pkg.bags.recorder import stamp_ns
 from policy_pkg.bags.topics import connections, load_typestore
 from policy_pkg.bags.writer import BagWriter, Split
-from policy_pkg.train.episode import Episode
+from policy_pkg.episode import Episode
 from sim_pkg.env import make_env
 from sim_pkg.session import Session
 

@@ -11,8 +11,8 @@ import pytest
 from bag_maker import Made, Sent, Team, change, messages, played, write
 from test_bag_round_trip import compare
 
+from policy_pkg.bags.dataset import RecordedEpisode, load_episodes
 from policy_pkg.bags.problems import BagError, Problem, Severity
-from policy_pkg.train.bag_dataset import RecordedEpisode, load_episodes
 
 Change = Callable[[list[Sent]], list[Sent]]
 

@@ -10,9 +10,9 @@ import pytest
 from bag_maker import Made, Team, messages, write
 from test_bag_round_trip import same
 
+from policy_pkg.bags.dataset import load_episodes
 from policy_pkg.bags.problems import Problem
 from policy_pkg.bags.writer import Split
-from policy_pkg.train.bag_dataset import load_episodes
 
 _LIMIT_S = 20.0
 

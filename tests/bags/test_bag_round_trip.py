@@ -12,9 +12,9 @@ from bag_maker import STORE, Made, Sent, Team, messages, played, write
 from rosbags.interfaces import Qos
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
+from crash_coach_common.contract import UserError
+from policy_pkg.bags.dataset import RecordedEpisode, load_episodes
 from policy_pkg.bags.writer import Split
-from policy_pkg.train.bag_dataset import RecordedEpisode, load_episodes
-from sim_pkg.contract import UserError
 
 EVENT = "crash_coach_interfaces/msg/FaultEvent"
 ARRAYS = ("obs", "state", "available", "actions", "reward", "faults")

@@ -13,13 +13,13 @@ from pathlib import Path
 import pytest
 from bag_maker import STORE, Made, Team, messages, write
 
+from crash_coach_common.contract import UserError
 from policy_pkg.bags.about import About, about_from_record
 from policy_pkg.bags.bag import Bag, Scan, bag_entries
 from policy_pkg.bags.problems import Problem
 from policy_pkg.bags.recorder import Recorder
 from policy_pkg.bags.records import Entry
 from policy_pkg.bags.writer import BagWriter, Split
-from sim_pkg.contract import UserError
 
 ENDLESS = """
 import sys, time

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from bag_maker import Made, Team, change, messages, played, write
 
+from crash_coach_common.contract import UserError
+from policy_pkg.bags.dataset import load_episodes
+from policy_pkg.bags.playback import play_back, read_episode
 from policy_pkg.bags.problems import BagError
-from policy_pkg.train.bag_dataset import load_episodes
-from policy_pkg.train.playback import play_back, read_episode
-from sim_pkg.config import find_scenario
-from sim_pkg.contract import UserError
+from sim_pkg.scenario_files import find_scenario
 
 
 @pytest.fixture(scope="module")

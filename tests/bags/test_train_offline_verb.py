@@ -13,14 +13,14 @@ import pytest
 from bag_maker import Made, Team, messages, played, write
 
 from crash_coach_bringup.cli.main import main
-from crash_coach_bringup.cli.report import report
-from crash_coach_bringup.cli.report_success import in_recordings
+from crash_coach_bringup.cli.report.success import in_recordings
+from crash_coach_bringup.cli.report.verb import report
 from crash_coach_bringup.ros.probe import find_executable
 from policy_pkg.bags.about import same_scenario
+from policy_pkg.bags.dataset import load_episodes
 from policy_pkg.checkpoint import load_policy
-from policy_pkg.train.bag_dataset import load_episodes
-from policy_pkg.train.offline_data import load_data
-from policy_pkg.train.results import find_runs, read_runs
+from policy_pkg.report.finished_runs import find_runs, read_runs
+from policy_pkg.train.offline.data import load_data
 
 QUICK = [
     "--set", "gradient_steps=6", "batch_episodes=4", "test_interval_steps=3", "test_episodes=2",

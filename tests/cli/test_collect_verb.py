@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from report_cases import write_run
 
-from crash_coach_bringup.cli.collect import collect
 from crash_coach_bringup.cli.output import CliError
-from crash_coach_bringup.cli.report import report
+from crash_coach_bringup.cli.report.verb import report
+from crash_coach_bringup.cli.verbs.collect import collect
+from policy_pkg.report.finished_runs import wall_time_s
 from policy_pkg.train.config import TrainConfig
-from policy_pkg.train.results import wall_time_s
 from policy_pkg.train.run_dir import RunError, prepare_run
 
 

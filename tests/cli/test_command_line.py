@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from in_process import refused
 
-from crash_coach_bringup.cli.crash_options import conditions, mode_parameters
 from crash_coach_bringup.cli.main import repeat_options
+from crash_coach_bringup.cli.options import conditions, mode_parameters
 from crash_coach_bringup.cli.output import CliError, check_json_target, write_json
-from crash_coach_bringup.cli.train import plan_jobs
+from crash_coach_bringup.cli.verbs.train import plan_jobs
 from crash_coach_bringup.ros.probe import find_executable
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env

@@ -10,24 +10,24 @@ from xml.etree import ElementTree
 import pytest
 from typer.testing import CliRunner, Result
 
-from crash_coach_bringup.cli.evaluate import Layout, Via
-from crash_coach_bringup.cli.faults import app
-from crash_coach_bringup.cli.faults_play import play
-from crash_coach_bringup.cli.faults_report import FILES
+from crash_coach_bringup.cli.faults.play import play
+from crash_coach_bringup.cli.faults.report import FILES
+from crash_coach_bringup.cli.faults.verb import app
 from crash_coach_bringup.cli.target import Target, load_target
+from crash_coach_bringup.cli.verbs.evaluate import Layout, Via
 from crash_coach_bringup.ros.probe import find_executable
-from crash_coach_pkg.config import TeamSpec
-from crash_coach_pkg.fault_scenario import (
+from crash_coach_common.contract import UserError
+from crash_coach_pkg.coach.config import TeamSpec
+from crash_coach_pkg.coach.fault_scenario import (
     ScenarioPlanner,
     fault_scenario_names,
     find_fault_scenario,
     load_fault_scenario,
 )
-from policy_pkg.train.conditions import crash_free
-from policy_pkg.train.evaluate import evaluate
-from policy_pkg.train.verdict import FaultRun, judge_run
+from policy_pkg.play.conditions import crash_free
+from policy_pkg.play.evaluate import evaluate
+from policy_pkg.report.verdict import FaultRun, judge_run
 from policy_pkg.untrained import write_untrained
-from sim_pkg.contract import UserError
 from sim_pkg.env import make_env
 
 COVERAGE = ("--policy", "scripted:coverage_adaptive", "--scenario", "coverage")

@@ -9,8 +9,8 @@ import pytest
 
 from crash_coach_bringup.cli.picture import TeamResults, draw_first_episodes
 from policy_pkg.checkpoint import load_policy
-from policy_pkg.train.conditions import crash_free, named
-from policy_pkg.train.evaluate import evaluate
+from policy_pkg.play.conditions import crash_free, named
+from policy_pkg.play.evaluate import evaluate
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 

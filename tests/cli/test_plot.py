@@ -22,11 +22,11 @@ from crash_coach_bringup.cli.curves import (
     load_run,
 )
 from crash_coach_bringup.cli.output import CliError
-from crash_coach_bringup.cli.plot import draw, legend, note, plot, targets
+from crash_coach_bringup.cli.verbs.plot import draw, legend, note, plot, targets
+from crash_coach_common.contract import UserError
 from policy_pkg.train.config import TrainConfig
-from policy_pkg.train.offline_config import OfflineConfig
+from policy_pkg.train.offline.config import OfflineConfig
 from policy_pkg.train.run_dir import prepare_run
-from sim_pkg.contract import UserError
 
 STEPS = (0, 100, 200)
 

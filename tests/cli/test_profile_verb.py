@@ -10,7 +10,7 @@ from typer.testing import CliRunner, Result
 
 from crash_coach_bringup.cli.main import app, repeat_options
 from crash_coach_bringup.cli.output import CliError
-from crash_coach_bringup.cli.profile import HINTS, TITLES, hints, summary
+from crash_coach_bringup.cli.verbs.profile import HINTS, TITLES, hints, summary
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.profile import PARTS, Profile
 

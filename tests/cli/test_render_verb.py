@@ -16,14 +16,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "bags"))
 from bag_maker import Team, messages, played, write
 from in_process import refused, typed
 
-from crash_coach_bringup.cli import calibrate
 from crash_coach_bringup.cli.main import main
+from crash_coach_bringup.cli.verbs import calibrate
 from crash_coach_bringup.ros.probe import find_executable
-from policy_pkg.train.conditions import exactly, named
-from policy_pkg.train.evaluate import Scripted, evaluate, record
+from policy_pkg.play.conditions import exactly, named
+from policy_pkg.play.evaluate import Scripted, evaluate, record
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
-from sim_pkg.frames import Frames
+from sim_pkg.render.frames import Frames
 
 RANDOM = ("scripted:random", "--scenario", "buttons")
 

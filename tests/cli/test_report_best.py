@@ -7,8 +7,8 @@ from pathlib import Path
 from in_process import refused
 from report_cases import results_of, write_run
 
-from crash_coach_bringup.cli.collect import collect
-from crash_coach_bringup.cli.report import report
+from crash_coach_bringup.cli.report.verb import report
+from crash_coach_bringup.cli.verbs.collect import collect
 
 
 def test_best_checkpoints_beside_the_last(tmp_path: Path) -> None:

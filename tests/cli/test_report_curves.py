@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crash_coach_bringup.cli.report_curves import (
+from crash_coach_bringup.cli.report.curves import (
     Curve,
     learning_curves,
     mean_curve,
     read_curve,
     running_mean,
 )
-from policy_pkg.train.results import Run
+from policy_pkg.report.finished_runs import Run
 from policy_pkg.train.run_dir import RunError
 
 

@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 from report_cases import write_run
 
-from crash_coach_bringup.cli.plot import style
-from crash_coach_bringup.cli.report import report
-from crash_coach_bringup.cli.report_curves import learning_curves
-from crash_coach_bringup.cli.report_figures import resilience
-from policy_pkg.train.conditions import exactly
-from policy_pkg.train.kept_evaluations import Evaluations
-from policy_pkg.train.report import rows
-from policy_pkg.train.results import find_runs, method_name, read_runs
+from crash_coach_bringup.cli.report.curves import learning_curves
+from crash_coach_bringup.cli.report.figures import resilience
+from crash_coach_bringup.cli.report.verb import report
+from crash_coach_bringup.cli.verbs.plot import style
+from policy_pkg.play.conditions import exactly
+from policy_pkg.report.finished_runs import find_runs, method_name, read_runs
+from policy_pkg.report.kept_evaluations import Evaluations
+from policy_pkg.report.rows import rows
 from policy_pkg.train.run_dir import RunError
 
 

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from crash_coach_pkg.bits import random_bits
-from crash_coach_pkg.gate import random_available
+from crash_coach_common.keyed_random import random_bits
+from crash_coach_pkg.faults.batch_faults import random_available
 from crash_coach_pkg.plan import NEXT_STEP, CrashPlan, Fault, TriggerKind
 from crash_coach_pkg.schedule import World
 

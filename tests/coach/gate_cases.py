@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from crash_coach_pkg.gate_state import GateState
-from crash_coach_pkg.gate_types import Command, Decision, Outputs, Sight
+from crash_coach_common.contract import BoolArray
+from crash_coach_pkg.gate.action_gate import GateState
+from crash_coach_pkg.gate.messages import Command, Decision, Outputs, Sight
+from crash_coach_pkg.gate.plan_book import TEAM, Event
 from crash_coach_pkg.plan import CrashPlan, Fault
-from crash_coach_pkg.plan_book import TEAM, Event
-from sim_pkg.contract import BoolArray
 
 LEASE_S = 1.0
 ALL = np.ones(8, dtype=np.bool_)

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from fault_oracle import OBSERVATION_MODES, WITHHELD, Oracle, random_action, world_of
 
-from crash_coach_pkg.gate_state import GateState
-from crash_coach_pkg.gate_types import Command, Decision, Outputs, Seen, Sight
+from crash_coach_pkg.gate.action_gate import GateState
+from crash_coach_pkg.gate.messages import Command, Decision, Outputs, Seen, Sight
+from crash_coach_pkg.gate.plan_book import TEAM, Event, EventKind
 from crash_coach_pkg.plan import CrashPlan, Fault
-from crash_coach_pkg.plan_book import TEAM, Event, EventKind
 
 ROBOTS = 3
 SEED = 99

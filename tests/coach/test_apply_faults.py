@@ -10,8 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crash_coach_pkg.bits import UInt64Array, random_bits
-from crash_coach_pkg.gate import MUTE_CODE, RANDOM_CODE, apply_faults, random_available
+from crash_coach_common.keyed_random import UInt64Array, random_bits
+from crash_coach_pkg.faults.batch_faults import (
+    MUTE_CODE,
+    RANDOM_CODE,
+    apply_faults,
+    random_available,
+)
 
 
 def _bits(seed: int, count: int) -> UInt64Array:

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from crash_coach_pkg.config import CoachConfig, TeamSpec, check_robots
-from crash_coach_pkg.control import Control, ControlSettings
-from crash_coach_pkg.parameters import build_settings, parameter_specs
+from crash_coach_common.contract import UserError
+from crash_coach_pkg.coach.config import CoachConfig, TeamSpec, check_robots
+from crash_coach_pkg.coach.live_coach import Control, ControlSettings
+from crash_coach_pkg.coach.parameters import build_settings, parameter_specs
 from crash_coach_pkg.plan import NEXT_STEP, CrashPlan, Fault
-from sim_pkg.contract import UserError
 
 TEAM = TeamSpec(("robot_1", "robot_2", "robot_3"), ("scout", "scout", "hauler"), 0.1)
 DEFAULTS = {spec.name: spec.default for spec in parameter_specs()}

@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from crash_coach_pkg.coach import Coach
-from crash_coach_pkg.config import CoachConfig, FaultConfig, TeamSpec
-from crash_coach_pkg.draws import check_team, draw_faults, draw_victims
+from crash_coach_common.contract import UserError
+from crash_coach_pkg.coach.coach import Coach
+from crash_coach_pkg.coach.config import CoachConfig, FaultConfig, TeamSpec
+from crash_coach_pkg.coach.draws import check_team, draw_faults, draw_victims
 from crash_coach_pkg.plan import Trigger, TriggerKind
 from crash_coach_pkg.schedule import Schedule
-from sim_pkg.contract import UserError
 from sim_pkg.env import make_env
 
 ROBOTS = tuple(f"robot_{i + 1}" for i in range(5))

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from crash_coach_pkg.expectations import DueFault, Expectation, Finding, Outcome, Pair, Trials
+from crash_coach_pkg.coach.expectations import DueFault, Expectation, Finding, Outcome, Pair, Trials
 
 
 def pair(

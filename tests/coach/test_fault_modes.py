@@ -11,15 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crash_coach_pkg.action_tools import ActionTools
 from crash_coach_pkg.faults import (
     fault_mode,
     make_fault,
 )
+from crash_coach_pkg.faults.action_tools import ActionTools
 from crash_coach_pkg.faults.base import CommandFault, Step
 from crash_coach_pkg.faults.schema import parameters_of
+from crash_coach_pkg.faults.team_faults import TeamFaults
 from crash_coach_pkg.plan import CrashPlan, Fault
-from crash_coach_pkg.team_faults import TeamFaults
 
 ACTIONS = 5
 Commands = list[tuple[int, list[bool]]]  # what the policy wants, and what is available

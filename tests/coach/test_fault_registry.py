@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from pydantic import Field
 
+from crash_coach_common.contract import UserError
 from crash_coach_pkg import faults
-from crash_coach_pkg.action_tools import ACTION_OFFERS
 from crash_coach_pkg.faults import (
     check_parameters,
     fault_mode,
@@ -18,11 +18,11 @@ from crash_coach_pkg.faults import (
     register,
     unmet_needs,
 )
+from crash_coach_pkg.faults.action_tools import ACTION_OFFERS
 from crash_coach_pkg.faults.base import FaultParameters, ObservationFault, Step
 from crash_coach_pkg.faults.schema import parameters_of
+from crash_coach_pkg.faults.team_faults import TeamFaults
 from crash_coach_pkg.plan import CrashPlan, Fault
-from crash_coach_pkg.team_faults import TeamFaults
-from sim_pkg.contract import UserError
 
 
 def test_the_catalogue() -> None:

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crash_coach_pkg.config import TeamSpec
-from crash_coach_pkg.fault_scenario import (
+from crash_coach_common.contract import UserError
+from crash_coach_pkg.coach.config import TeamSpec
+from crash_coach_pkg.coach.fault_scenario import (
     FaultScenario,
     ScenarioPlanner,
     fault_scenario_names,
@@ -19,7 +20,6 @@ from crash_coach_pkg.fault_scenario import (
 )
 from crash_coach_pkg.plan import CrashPlan, TriggerKind
 from crash_coach_pkg.schedule import Schedule
-from sim_pkg.contract import UserError
 
 TEAM = TeamSpec(
     ("robot_1", "robot_2", "robot_3", "robot_4"), ("scout", "scout", "lifter", "lifter"), 0.5

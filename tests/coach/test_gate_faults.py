@@ -20,10 +20,10 @@ from gate_cases import (
 )
 
 from crash_coach_pkg.effects import WITHHELD
-from crash_coach_pkg.gate_state import GateState
-from crash_coach_pkg.gate_types import Seen
+from crash_coach_pkg.gate.action_gate import GateState
+from crash_coach_pkg.gate.messages import Seen
+from crash_coach_pkg.gate.plan_book import Event, EventKind
 from crash_coach_pkg.plan import NEXT_STEP, Fault, Trigger, TriggerKind
-from crash_coach_pkg.plan_book import Event, EventKind
 from crash_coach_pkg.schedule import World
 
 

@@ -16,12 +16,12 @@ from gate_cases import (
     sight,
 )
 
-from crash_coach_pkg.bits import random_bits
+from crash_coach_common.keyed_random import random_bits
 from crash_coach_pkg.effects import WITHHELD
-from crash_coach_pkg.gate import random_available
-from crash_coach_pkg.gate_types import Command, Decision
+from crash_coach_pkg.faults.batch_faults import random_available
+from crash_coach_pkg.gate.messages import Command, Decision
+from crash_coach_pkg.gate.plan_book import EventKind
 from crash_coach_pkg.plan import NEXT_STEP, Fault
-from crash_coach_pkg.plan_book import EventKind
 
 
 def test_lockstep_holds_until_the_plan_of_the_episode() -> None:

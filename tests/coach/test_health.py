@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from crash_coach_pkg.health import Decided, Report, RobotState, TeamHealth
+from crash_coach_pkg.gate.health import Decided, Report, RobotState, TeamHealth
 
 TIMEOUT_S = 0.5
 

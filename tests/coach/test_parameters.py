@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from crash_coach_pkg.config import TeamSpec
-from crash_coach_pkg.control import ControlSettings
-from crash_coach_pkg.faults import fault_mode, mode_names
-from crash_coach_pkg.parameters import (
+from crash_coach_common.contract import UserError
+from crash_coach_pkg.coach.config import TeamSpec
+from crash_coach_pkg.coach.live_coach import ControlSettings
+from crash_coach_pkg.coach.parameters import (
     START_SPECS,
     build_settings,
     build_team,
@@ -18,7 +18,7 @@ from crash_coach_pkg.parameters import (
     counts_now,
     parameter_specs,
 )
-from sim_pkg.contract import UserError
+from crash_coach_pkg.faults import fault_mode, mode_names
 
 TEAM = TeamSpec(("robot_1", "robot_2", "robot_3"), ("scout", "scout", "hauler"), 0.1)
 DEFAULTS = {spec.name: spec.default for spec in parameter_specs()}

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crash_coach_pkg.effects import RELAYED, WITHHELD
+from crash_coach_pkg.gate.plan_book import EventKind
+from crash_coach_pkg.gate.relay_gate import Outputs, Relay, Sent
 from crash_coach_pkg.plan import NEXT_STEP, CrashPlan, Fault, Trigger, TriggerKind
-from crash_coach_pkg.plan_book import EventKind
-from crash_coach_pkg.relay import Outputs, Relay, Sent
 from crash_coach_pkg.ros.command_types import OpaqueTools
 
 N = 3

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from crash_coach_pkg import strategies
-from crash_coach_pkg.coach import Coach
-from crash_coach_pkg.config import CoachConfig, TeamSpec
-from crash_coach_pkg.strategies import Progress, make_strategy
+from crash_coach_pkg.coach import strategies
+from crash_coach_pkg.coach.coach import Coach
+from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.strategies import Progress, make_strategy
 
 TEAM = TeamSpec(("robot_1", "robot_2", "robot_3"))
 NOWHERE = Progress(env_steps=0, total_steps=0, episodes=0)

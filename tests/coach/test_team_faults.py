@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crash_coach_pkg.action_tools import ActionTools
 from crash_coach_pkg.faults import mode_code
-from crash_coach_pkg.gate import apply_faults
+from crash_coach_pkg.faults.action_tools import ActionTools
+from crash_coach_pkg.faults.batch_faults import apply_faults
+from crash_coach_pkg.faults.team_faults import TeamFaults
 from crash_coach_pkg.plan import CrashPlan, Fault, Trigger, TriggerKind
-from crash_coach_pkg.team_faults import TeamFaults
 
 N, STEPS, ACTIONS = 3, 12, 4
 ALL = ActionTools(np.ones(ACTIONS, dtype=np.bool_), 0)

@@ -11,16 +11,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from crash_coach_common.contract import UserError
 from crash_coach_console.access import Access
 from crash_coach_console.board import KEPT_EVENTS, Board, Cursor
 from crash_coach_console.episodes import MOST_GROUPS, Costs, EpisodeBook, Played
 from crash_coach_console.operating import OperatorError, victims_left, with_others
 from crash_coach_console.requests import Clear, Inject, RequestError, parse_request
 from crash_coach_console.team import LiveTeam, Plan, PlannedFault
+from crash_coach_pkg.coach.parameters import parameter_specs
 from crash_coach_pkg.injection import injection
-from crash_coach_pkg.parameters import parameter_specs
-from policy_pkg.train.statistics import mean_interval, wilson
-from sim_pkg.contract import UserError
+from policy_pkg.statistics import mean_interval, wilson
 
 
 def told(board: Board, cursor: Cursor) -> list[dict[str, Any]]:

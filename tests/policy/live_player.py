@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from crash_coach_pkg.coach import Coach
-from crash_coach_pkg.config import TeamSpec
+from crash_coach_pkg.coach.coach import Coach
+from crash_coach_pkg.coach.config import TeamSpec
+from crash_coach_pkg.coach.strategies import Progress
 from crash_coach_pkg.plan import CrashPlan
-from crash_coach_pkg.strategies import Progress
 from policy_pkg.agent import Sensed
+from policy_pkg.bags.dataset import RecordedEpisode
+from policy_pkg.episode import Episode
 from policy_pkg.live_weights import LiveAgent, Weights
-from policy_pkg.train.bag_dataset import RecordedEpisode
 from policy_pkg.train.config import TrainConfig, graph_seed
-from policy_pkg.train.episode import Episode
-from policy_pkg.train.live_order import Lockstep, Task
-from policy_pkg.train.live_session import LiveSession
+from policy_pkg.train.live.order import Lockstep, Task
+from policy_pkg.train.live.session import LiveSession
 from policy_pkg.train.metrics import Value
 from sim_pkg.env import Env, make_env
 from sim_pkg.session import Session as Sim

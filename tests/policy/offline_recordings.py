@@ -8,13 +8,13 @@ import numpy as np
 import numpy.typing as npt
 from reference_learner import random_episode
 
-from crash_coach_pkg.coach import Coach
-from crash_coach_pkg.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.coach import Coach
+from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from policy_pkg.episode import Episode, Sizes
+from policy_pkg.learner.config import LearnerConfig
+from policy_pkg.learner.learner import Learner
+from policy_pkg.play.rollout import Rollout
 from policy_pkg.policy import RecurrentPolicy
-from policy_pkg.train.episode import Episode, Sizes
-from policy_pkg.train.learner import Learner
-from policy_pkg.train.learner_config import LearnerConfig
-from policy_pkg.train.rollout import Rollout
 from sim_pkg.env import make_env
 
 SIZES = Sizes(

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from policy_pkg.train.episode import Episode, Sizes
+from policy_pkg.episode import Episode, Sizes
 
 Params = dict[str, Tensor]
 

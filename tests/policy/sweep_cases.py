@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from policy_pkg.checkpoint import find_checkpoint
-from policy_pkg.train.sweep_config import SweepRun, load_sweep
+from policy_pkg.sweep.config import SweepRun, load_sweep
 
 TINY: dict[str, Any] = {
     "config": "buttons/qmix",
@@ -51,7 +51,7 @@ def tiny_runs(folder: Path, **changes: Any) -> list[SweepRun]:
 
 def train_alone(runs: Sequence[SweepRun], out: Path) -> None:
     """Every run once, in this process, without a sweep."""
-    from policy_pkg.train.trainer import train
+    from policy_pkg.train.run import train
 
     for run in runs:
         train(run.config, out / run.name)

@@ -10,9 +10,9 @@ import pytest
 from small_run import small
 
 from policy_pkg.checkpoint import BEST, list_checkpoints, load_policy, read_manifest
-from policy_pkg.train.evaluate import EpisodeResult, Evaluation
+from policy_pkg.play.evaluate import EpisodeResult, Evaluation
+from policy_pkg.train.run import train
 from policy_pkg.train.session import Block
-from policy_pkg.train.trainer import train
 
 
 def played(successes: int, crashed: tuple[int, ...] = (), episodes: int = 10) -> Evaluation:
@@ -60,8 +60,8 @@ def test_a_run_keeps_the_best_of_its_blocks(tmp_path: Path) -> None:
 
 
 def test_settings_that_graphs_cannot_keep_are_refused() -> None:
-    from policy_pkg.train.live_session import LiveSession
-    from sim_pkg.contract import UserError
+    from crash_coach_common.contract import UserError
+    from policy_pkg.train.live.session import LiveSession
     from sim_pkg.env import make_env
 
     spec = make_env("buttons", 1).spec

@@ -21,8 +21,8 @@ from policy_pkg.checkpoint import (
     read_tensors,
     write_checkpoint,
 )
-from policy_pkg.train import agent_net
-from policy_pkg.train.episode import Sizes
+from policy_pkg.episode import Sizes
+from policy_pkg.learner import agent_net
 
 SIZES = Sizes(n_robots=2, n_actions=5, obs_size=3, state_size=4, episode_limit=9)
 

@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crash_coach_pkg.config import CoachConfig
+from crash_coach_common.contract import EnvSpec, UserError
+from crash_coach_common.strict_yaml import ConfigError
+from crash_coach_pkg.coach.config import CoachConfig
 from policy_pkg.checkpoint import CheckpointError, PolicyBundle
+from policy_pkg.episode import Sizes
+from policy_pkg.learner.config import LearnerConfig
+from policy_pkg.learner.learner import Learner
+from policy_pkg.play.conditions import Condition, at_rate, crash_free, exactly, named
+from policy_pkg.play.evaluate import Evaluation, Scripted, evaluate, record
 from policy_pkg.policy import RecurrentPolicy
-from policy_pkg.train.conditions import Condition, at_rate, crash_free, exactly, named
-from policy_pkg.train.episode import Sizes
-from policy_pkg.train.evaluate import Evaluation, Scripted, evaluate, record
-from policy_pkg.train.learner import Learner
-from policy_pkg.train.learner_config import LearnerConfig
-from sim_pkg.config import ConfigError
-from sim_pkg.contract import EnvSpec, UserError
 from sim_pkg.env import make_env
 
 SCENARIO = "buttons"

@@ -9,19 +9,19 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from crash_coach_pkg.coach import Coach
-from crash_coach_pkg.config import CoachConfig, TeamSpec
+from crash_coach_common.contract import UserError
+from crash_coach_pkg.coach.coach import Coach
+from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
 from crash_coach_pkg.effects import OBSERVED, WITHHELD, EffectRow
 from crash_coach_pkg.faults import mode_names
 from crash_coach_pkg.plan import CrashPlan, Fault, Trigger, TriggerKind
+from policy_pkg.episode import Sizes
+from policy_pkg.learner.config import LearnerConfig
+from policy_pkg.learner.learner import Learner
+from policy_pkg.play.conditions import Condition, Planned, crash_free, named
+from policy_pkg.play.evaluate import Evaluation, Scripted, evaluate
+from policy_pkg.play.rollout import Finished, Rollout, plan_from_json, plan_to_json
 from policy_pkg.policy import RecurrentPolicy
-from policy_pkg.train.conditions import Condition, Planned, crash_free, named
-from policy_pkg.train.episode import Sizes
-from policy_pkg.train.evaluate import Evaluation, Scripted, evaluate
-from policy_pkg.train.learner import Learner
-from policy_pkg.train.learner_config import LearnerConfig
-from policy_pkg.train.rollout import Finished, Rollout, plan_from_json, plan_to_json
-from sim_pkg.contract import UserError
 from sim_pkg.env import make_env
 
 ACTION_MODES = [mode for mode in mode_names() if mode not in ("bias", "scale")]

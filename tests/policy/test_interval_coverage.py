@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from policy_pkg.train.statistics import (
+from policy_pkg.statistics import (
     Estimate,
     binomial_weights,
     bootstrap_interquartile_mean,

@@ -9,10 +9,10 @@ import pytest
 import torch
 from reference_learner import Reference, loss, params_of, random_episode
 
-from policy_pkg.train.episode import Episode, Sizes
-from policy_pkg.train.learner import Learner
-from policy_pkg.train.learner_config import LearnerConfig
-from policy_pkg.train.replay import Batch, Replay
+from policy_pkg.episode import Episode, Sizes
+from policy_pkg.learner.config import LearnerConfig
+from policy_pkg.learner.learner import Learner
+from policy_pkg.learner.replay import Batch, Replay
 
 SIZES = Sizes(
     n_robots=3, n_actions=4, obs_size=5, state_size=6, episode_limit=7, stay_actions=(2, 0)

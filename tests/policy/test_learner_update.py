@@ -10,10 +10,10 @@ import torch
 from pydantic import ValidationError
 from reference_learner import random_episode
 
-from policy_pkg.train.episode import Sizes
-from policy_pkg.train.learner import DivergedError, Learner
-from policy_pkg.train.learner_config import LearnerConfig
-from policy_pkg.train.replay import Batch, Replay
+from policy_pkg.episode import Sizes
+from policy_pkg.learner.config import LearnerConfig
+from policy_pkg.learner.learner import DivergedError, Learner
+from policy_pkg.learner.replay import Batch, Replay
 
 SIZES = Sizes(n_robots=2, n_actions=3, obs_size=4, state_size=5, episode_limit=6)
 SMALL: dict[str, Any] = {"hidden": 8, "mixing_hidden": 4, "hypernet_hidden": 6}

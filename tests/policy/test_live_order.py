@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from live_player import SPEC, InProcess, Player, small
 
+from crash_coach_common.contract import UserError
+from policy_pkg.bags.dataset import RecordedEpisode
 from policy_pkg.checkpoint import CheckpointError, load_policy
-from policy_pkg.train.bag_dataset import RecordedEpisode
 from policy_pkg.train.config import TrainConfig
-from policy_pkg.train.live import LiveRun
-from policy_pkg.train.live_order import LAG, RealTime, Task
-from policy_pkg.train.live_session import LiveSession
+from policy_pkg.train.live.order import LAG, RealTime, Task
+from policy_pkg.train.live.run import LiveRun
+from policy_pkg.train.live.session import LiveSession
 from policy_pkg.train.metrics import Value
+from policy_pkg.train.run import train
 from policy_pkg.train.run_dir import RunError
-from policy_pkg.train.trainer import train
-from sim_pkg.contract import UserError
 
 
 @pytest.mark.parametrize("graphs", [1, 3])

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
+from crash_coach_common.contract import UserError
 from policy_pkg.act import Exploration, greedy
 from policy_pkg.agent import Sensed
 from policy_pkg.live_weights import LiveAgent, Weights
 from policy_pkg.policy import weight_shapes
-from sim_pkg.contract import UserError
 
 TEAM = ("robot_1", "robot_2", "robot_3")
 OBS, ACTIONS, HIDDEN = 4, 5, 8

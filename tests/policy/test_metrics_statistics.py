@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from policy_pkg.train.metrics import JsonLines, Means
-from policy_pkg.train.statistics import (
+from crash_coach_common.contract import UserError
+from policy_pkg.statistics import (
     binomial_weights,
     bootstrap_interquartile_mean,
     interquartile_mean,
@@ -19,7 +19,7 @@ from policy_pkg.train.statistics import (
     reweighted_success,
     wilson,
 )
-from sim_pkg.contract import UserError
+from policy_pkg.train.metrics import JsonLines, Means
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,13 @@ import torch
 from reference_learner import random_episode
 from torch import nn
 
+from policy_pkg.episode import Episode, Sizes
+from policy_pkg.learner import agent_net, mixer
+from policy_pkg.learner.config import LearnerConfig
+from policy_pkg.learner.learner import Learner
+from policy_pkg.learner.packed_gru import Schedule
+from policy_pkg.learner.replay import Batch, Replay
 from policy_pkg.policy import RecurrentPolicy
-from policy_pkg.train import agent_net, mixer
-from policy_pkg.train.episode import Episode, Sizes
-from policy_pkg.train.learner import Learner
-from policy_pkg.train.learner_config import LearnerConfig
-from policy_pkg.train.packed_gru import Schedule
-from policy_pkg.train.replay import Batch, Replay
 
 SIZES = Sizes(n_robots=3, n_actions=4, obs_size=5, state_size=6, episode_limit=9)
 

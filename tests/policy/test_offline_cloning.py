@@ -11,12 +11,12 @@ from offline_recordings import SIZES, random_recordings
 from reference_learner import params_of, values
 
 from policy_pkg.act import greedy
+from policy_pkg.episode import Episode, Sizes
+from policy_pkg.learner.cloner import Cloner
+from policy_pkg.learner.config import LearnerConfig
+from policy_pkg.learner.learner import DivergedError
+from policy_pkg.learner.replay import Batch, Replay
 from policy_pkg.policy import RecurrentPolicy
-from policy_pkg.train.behaviour_cloning import Cloner
-from policy_pkg.train.episode import Episode, Sizes
-from policy_pkg.train.learner import DivergedError
-from policy_pkg.train.learner_config import LearnerConfig
-from policy_pkg.train.replay import Batch, Replay
 
 MEMORY = Sizes(n_robots=2, n_actions=3, obs_size=1, state_size=1, episode_limit=3)
 

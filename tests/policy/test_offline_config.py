@@ -6,14 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from crash_coach_common.strict_yaml import ConfigError, load_tree
+from policy_pkg.learner.config import LearnerConfig
 from policy_pkg.train.config import load_train_config, train_config_names
-from policy_pkg.train.learner_config import LearnerConfig
-from policy_pkg.train.offline_config import (
-    OfflineConfig,
-    load_offline_config,
-    offline_config_names,
-)
-from sim_pkg.config import ConfigError, load_tree
+from policy_pkg.train.offline.config import OfflineConfig, load_offline_config, offline_config_names
 from sim_pkg.env import make_env
 
 SHIPPED = Path(__file__).parents[2] / "configs" / "train"

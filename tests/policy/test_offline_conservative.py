@@ -11,11 +11,11 @@ from offline_recordings import SIZES, random_recordings
 from reference_learner import Reference, loss, params_of, values
 from torch import Tensor
 
-from policy_pkg.train.cross_entropy import cross_entropy, robot_step_weights
-from policy_pkg.train.episode import Episode, Sizes
-from policy_pkg.train.learner import Learner
-from policy_pkg.train.learner_config import LearnerConfig
-from policy_pkg.train.replay import Batch, Replay
+from policy_pkg.episode import Episode, Sizes
+from policy_pkg.learner.config import LearnerConfig
+from policy_pkg.learner.cross_entropy import cross_entropy, robot_step_weights
+from policy_pkg.learner.learner import Learner
+from policy_pkg.learner.replay import Batch, Replay
 
 SMALL: dict[str, Any] = {"hidden": 8, "mixing_hidden": 4, "hypernet_hidden": 6}
 

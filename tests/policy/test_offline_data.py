@@ -10,12 +10,12 @@ import pytest
 from offline_recordings import SIZES, Recording, random_recordings, recording, with_crashes
 from reference_learner import random_episode
 
-from policy_pkg.train.crash_weights import crash_weights
-from policy_pkg.train.episode import Episode
-from policy_pkg.train.learner import Learner
-from policy_pkg.train.learner_config import LearnerConfig
-from policy_pkg.train.offline_data import DataError, FixedData, load_data
-from policy_pkg.train.statistics import binomial_weights
+from policy_pkg.episode import Episode
+from policy_pkg.learner.config import LearnerConfig
+from policy_pkg.learner.learner import Learner
+from policy_pkg.statistics import binomial_weights
+from policy_pkg.train.offline.crash_weights import crash_weights
+from policy_pkg.train.offline.data import DataError, FixedData, load_data
 from sim_pkg.env import make_env
 
 SMALL: dict[str, Any] = {"hidden": 8, "mixing_hidden": 4, "hypernet_hidden": 6}

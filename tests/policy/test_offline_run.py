@@ -17,20 +17,20 @@ from offline_recordings import (
     with_crashes,
 )
 
+from crash_coach_common.contract import UserError
 from policy_pkg.checkpoint import CheckpointError, find_checkpoint, load_policy, read_manifest
 from policy_pkg.checkpoint import read_tensors as tensors_of
-from policy_pkg.train import offline
-from policy_pkg.train.conditions import crash_free
-from policy_pkg.train.evaluate import evaluate
-from policy_pkg.train.learner import Learner
-from policy_pkg.train.offline import OfflineReport, OfflineSummary, read_data
-from policy_pkg.train.offline_config import OfflineConfig
-from policy_pkg.train.offline_data import load_data
-from policy_pkg.train.offline_session import MEANS, OfflineSession
+from policy_pkg.learner.learner import Learner
+from policy_pkg.play.conditions import crash_free
+from policy_pkg.play.evaluate import evaluate
+from policy_pkg.statistics import binomial_weights
+from policy_pkg.train.offline import run as offline
+from policy_pkg.train.offline.config import OfflineConfig
+from policy_pkg.train.offline.data import load_data
+from policy_pkg.train.offline.run import OfflineReport, OfflineSummary, read_data
+from policy_pkg.train.offline.session import MEANS, OfflineSession
+from policy_pkg.train.run import TrainError
 from policy_pkg.train.run_dir import RunError
-from policy_pkg.train.statistics import binomial_weights
-from policy_pkg.train.trainer import TrainError
-from sim_pkg.contract import UserError
 
 SMALL: dict[str, Any] = {
     "scenario": "buttons",

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from policy_pkg.train.paired import PairedDifference, paired_differences
-from policy_pkg.train.report import ALL_MAPS, Row, best
+from policy_pkg.report.paired import PairedDifference, paired_differences
+from policy_pkg.report.rows import ALL_MAPS, Row, best
 
 
 def row(

@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from policy_pkg.act import Explorer, greedy
+from policy_pkg.episode import Episode, Sizes
+from policy_pkg.learner import agent_net
+from policy_pkg.learner.config import LearnerConfig
+from policy_pkg.learner.learner import Learner
+from policy_pkg.learner.packed_gru import Schedule
+from policy_pkg.learner.replay import Replay
 from policy_pkg.policy import RecurrentPolicy
-from policy_pkg.train import agent_net
-from policy_pkg.train.episode import Episode, Sizes
-from policy_pkg.train.learner import Learner
-from policy_pkg.train.learner_config import LearnerConfig
-from policy_pkg.train.packed_gru import Schedule
-from policy_pkg.train.replay import Replay
 
 SIZES = Sizes(n_robots=3, n_actions=6, obs_size=7, state_size=4, episode_limit=9)
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from small_run import small
 
+from crash_coach_common.contract import UserError
 from policy_pkg.train.profile import EVALUATION, PARTS, REST, Profile, Stopwatch, profile
-from policy_pkg.train.trainer import train
-from sim_pkg.contract import UserError
+from policy_pkg.train.run import train
 
 
 class Team:

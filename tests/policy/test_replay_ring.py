@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from reference_learner import random_episode
 
-from policy_pkg.train.episode import Episode, Sizes
-from policy_pkg.train.replay import Replay
+from policy_pkg.episode import Episode, Sizes
+from policy_pkg.learner.replay import Replay
 
 SIZES = Sizes(n_robots=2, n_actions=3, obs_size=4, state_size=5, episode_limit=6)
 
@@ -177,7 +177,7 @@ def test_memory_follows_what_is_stored() -> None:
 
 def test_replay_and_settings_need_no_torch() -> None:
     code = (
-        "import sys, policy_pkg.train.replay, policy_pkg.train.learner_config;"
+        "import sys, policy_pkg.learner.replay, policy_pkg.learner.config;"
         "sys.exit('torch' in sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from reference_learner import random_episode
 
-from policy_pkg.train.episode import Sizes
-from policy_pkg.train.replay import Replay
-from policy_pkg.train.strata import Strata
+from policy_pkg.episode import Sizes
+from policy_pkg.learner.replay import Replay
+from policy_pkg.learner.strata import Strata
 
 SIZES = Sizes(n_robots=2, n_actions=3, obs_size=4, state_size=5, episode_limit=6)
 # (robots crashed, success): how many episodes

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from crash_coach_common.contract import UserError
 from policy_pkg.checkpoint import (
     BEST,
     CheckpointError,
@@ -21,8 +22,7 @@ from policy_pkg.checkpoint import (
     read_tensors,
 )
 from policy_pkg.train.config import TrainConfig
-from policy_pkg.train.trainer import Phase, ProgressReport, train
-from sim_pkg.contract import UserError
+from policy_pkg.train.run import Phase, ProgressReport, train
 
 CONFIG = TrainConfig.model_validate(
     {
@@ -157,7 +157,7 @@ SCRIPT = """
 import sys
 from pathlib import Path
 from policy_pkg.train.config import TrainConfig
-from policy_pkg.train.trainer import train
+from policy_pkg.train.run import train
 train(TrainConfig.model_validate_json(sys.argv[2]), Path(sys.argv[1]), resume=True)
 """
 

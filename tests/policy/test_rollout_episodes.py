@@ -12,17 +12,17 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from crash_coach_pkg.coach import Coach
-from crash_coach_pkg.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.coach import Coach
+from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
 from crash_coach_pkg.plan import CrashPlan
 from policy_pkg.checkpoint import CheckpointError
+from policy_pkg.episode import Sizes
+from policy_pkg.learner.config import LearnerConfig
+from policy_pkg.learner.learner import Learner
+from policy_pkg.play.rollout import Finished, Rollout
 from policy_pkg.policy import RecurrentPolicy
-from policy_pkg.train.episode import Sizes
-from policy_pkg.train.learner import Learner
-from policy_pkg.train.learner_config import LearnerConfig
-from policy_pkg.train.rollout import Finished, Rollout
-from sim_pkg.config import find_scenario
 from sim_pkg.env import make_env
+from sim_pkg.scenario_files import find_scenario
 
 SEED = 5
 RANDOM = CoachConfig(strategy="fixed", crash_rate=0.5, crash_mode="random", duration_steps=6)

@@ -21,7 +21,7 @@ TRAIN = """
 import sys
 from pathlib import Path
 from policy_pkg.train.config import TrainConfig
-from policy_pkg.train.trainer import train
+from policy_pkg.train.run import train
 train(TrainConfig.model_validate_json(sys.argv[2]), Path(sys.argv[1]))
 """
 ROWS = """

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 from sweep_cases import tiny_runs, write_sweep
 
+from crash_coach_common.strict_yaml import ConfigError
+from policy_pkg.report.finished_runs import method_name
+from policy_pkg.sweep.config import find_sweep, load_sweep, sweep_names
 from policy_pkg.train.config import train_config_names
-from policy_pkg.train.results import method_name
-from policy_pkg.train.sweep_config import find_sweep, load_sweep, sweep_names
-from sim_pkg.config import ConfigError
 
 
 def test_runs_have_stable_names_seed_by_seed(tmp_path: Path) -> None:

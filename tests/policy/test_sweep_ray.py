@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from sweep_cases import assert_same_results, processes_of, tiny_runs, train_alone
 
+from policy_pkg.sweep.folder import RunFiles
+from policy_pkg.sweep.sweep import Snapshot, Sweep
 from policy_pkg.train.run_dir import RunError
-from policy_pkg.train.sweep import Snapshot, Sweep
-from policy_pkg.train.sweep_files import RunFiles
 
 
 @pytest.fixture(autouse=True)
@@ -24,7 +24,7 @@ def _as_nice_as_this(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_lost_node_loses_no_run_and_repeats_none(tmp_path: Path) -> None:
     from ray.cluster_utils import Cluster
 
-    from policy_pkg.train.sweep_ray import RayEngine
+    from policy_pkg.sweep.ray_engine import RayEngine
 
     runs, out = tiny_runs(tmp_path, total_steps=6000, seeds=[0, 1, 2]), tmp_path / "out"
     train_alone(runs, tmp_path / "alone")
@@ -59,7 +59,7 @@ def test_a_lost_node_loses_no_run_and_repeats_none(tmp_path: Path) -> None:
 def test_a_cluster_that_cannot_do_runs_is_refused(tmp_path: Path) -> None:
     from ray.cluster_utils import Cluster
 
-    from policy_pkg.train.sweep_ray import RayEngine
+    from policy_pkg.sweep.ray_engine import RayEngine
 
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
     try:

@@ -12,11 +12,8 @@ import pytest
 from sweep_cases import tiny_runs
 
 from policy_pkg.checkpoint import CHECKPOINTS
-from policy_pkg.train.config import TrainConfig
-from policy_pkg.train.run_dir import RunError, prepare_run
-from policy_pkg.train.sweep import Ended, Event, Snapshot, Sweep
-from policy_pkg.train.sweep_config import SweepRun
-from policy_pkg.train.sweep_files import (
+from policy_pkg.sweep.config import SweepRun
+from policy_pkg.sweep.folder import (
     RunFiles,
     RunProgress,
     check_mark,
@@ -26,7 +23,10 @@ from policy_pkg.train.sweep_files import (
     standing,
     write_progress,
 )
-from policy_pkg.train.sweep_task import Task
+from policy_pkg.sweep.sweep import Ended, Event, Snapshot, Sweep
+from policy_pkg.sweep.task import Task
+from policy_pkg.train.config import TrainConfig
+from policy_pkg.train.run_dir import RunError, prepare_run
 
 
 def write_run(folder: Path, config: TrainConfig, steps: int) -> None:
@@ -123,9 +123,9 @@ def test_a_machine_that_sees_another_folder_is_told(tmp_path: Path) -> None:
 
 def test_without_ray_it_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.delitem(sys.modules, "policy_pkg.train.sweep_ray", raising=False)
+    monkeypatch.delitem(sys.modules, "policy_pkg.sweep.ray_engine", raising=False)
     with pytest.raises(RunError, match=r"--engine ray needs the extra package ray: .*make ray"):
-        importlib.import_module("policy_pkg.train.sweep_ray")
+        importlib.import_module("policy_pkg.sweep.ray_engine")
 
 
 def test_progress_is_read_as_it_was_written(tmp_path: Path) -> None:

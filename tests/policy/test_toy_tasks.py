@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from policy_pkg.act import greedy
+from policy_pkg.episode import Episode, Sizes
+from policy_pkg.learner.config import LearnerConfig
+from policy_pkg.learner.learner import Learner
+from policy_pkg.learner.replay import Replay
 from policy_pkg.policy import RecurrentPolicy
-from policy_pkg.train.episode import Episode, Sizes
-from policy_pkg.train.learner import Learner
-from policy_pkg.train.learner_config import LearnerConfig
-from policy_pkg.train.replay import Replay
 
 FAST: dict[str, Any] = {
     "hidden": 32,

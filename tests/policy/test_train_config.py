@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
+from crash_coach_common.strict_yaml import ConfigError, load_tree
 from policy_pkg.train.config import TrainConfig, load_train_config, train_config_names
-from sim_pkg.config import ConfigError, load_tree
 from sim_pkg.env import make_env
 
 SHIPPED = Path(__file__).parents[2] / "configs" / "train"

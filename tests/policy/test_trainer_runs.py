@@ -14,13 +14,13 @@ import pytest
 from safetensors.numpy import load_file
 from small_run import SMALL, small
 
+from crash_coach_common.contract import EnvSpec, IntArray, StepResult, UserError
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.metrics import __doc__ as METRICS_DOC
+from policy_pkg.train.run import ProgressReport, TrainError, train
 from policy_pkg.train.run_dir import RunError, locked, prepare_run
 from policy_pkg.train.session import Session
-from policy_pkg.train.trainer import ProgressReport, TrainError, train
-from sim_pkg.contract import EnvSpec, IntArray, StepResult, UserError
 from sim_pkg.env import Env, make_env
 
 

@@ -12,11 +12,11 @@ import numpy as np
 from reference_learner import mix, params_of, values
 
 from policy_pkg.act import greedy
+from policy_pkg.episode import Episode, Sizes
+from policy_pkg.learner.config import LearnerConfig
+from policy_pkg.learner.learner import Learner
+from policy_pkg.learner.replay import Replay
 from policy_pkg.policy import RecurrentPolicy
-from policy_pkg.train.episode import Episode, Sizes
-from policy_pkg.train.learner import Learner
-from policy_pkg.train.learner_config import LearnerConfig
-from policy_pkg.train.replay import Replay
 
 SIZES = Sizes(n_robots=2, n_actions=2, obs_size=3, state_size=3, episode_limit=2)
 PAYOFF_2B = np.array([[0.0, 1.0], [1.0, 8.0]])

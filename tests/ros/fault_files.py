@@ -7,8 +7,8 @@ from typing import Any
 
 import yaml
 
-from crash_coach_pkg.action_tools import ACTION_OFFERS
 from crash_coach_pkg.faults import mode_names, unmet_needs
+from crash_coach_pkg.faults.action_tools import ACTION_OFFERS
 
 SCENARIO = "coverage"
 ROBOTS = 4

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from crash_coach_common.contract import EnvSpec
 from policy_pkg.act import greedy, least_valued
 from policy_pkg.agent import Agent, Answer, Sensed
 from policy_pkg.checkpoint import PolicyBundle
-from sim_pkg.contract import EnvSpec
 
 OBS, ACTIONS, ROBOTS = 6, 5, 3
 SPEC = EnvSpec(

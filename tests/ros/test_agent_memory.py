@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from policy_team import ALL, OBS, ROBOTS, SPEC, actions, make_agent, sense
 
+from crash_coach_common.contract import UserError
 from policy_pkg.act import greedy
 from policy_pkg.agent import ObservationError, Sensed
 from policy_pkg.checkpoint import PolicyBundle, load_policy
 from policy_pkg.untrained import write_untrained
-from sim_pkg.contract import UserError
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,9 @@ import pytest
 from coach_graph import ROBOTS, Graph, Team, graph, operator, process, run_to_end, team
 from crash_coach_interfaces.msg import CrashPlan, FaultEvent
 
-from crash_coach_pkg.coach import Coach
-from crash_coach_pkg.config import CoachConfig, TeamSpec
-from crash_coach_pkg.parameters import START_SPECS, parameter_specs
+from crash_coach_pkg.coach.coach import Coach
+from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.parameters import START_SPECS, parameter_specs
 
 
 def new_plan(team: Team, wanted: Callable[[CrashPlan], bool], what: str) -> CrashPlan:

@@ -11,15 +11,15 @@ import numpy as np
 from coach_graph import ROBOTS, Team, graph, operator, process, run_to_end, team
 from crash_coach_interfaces.msg import Action, CrashPlan, Fault, FaultEvent
 
-from crash_coach_pkg.coach import Coach
-from crash_coach_pkg.config import CoachConfig, TeamSpec
-from crash_coach_pkg.fault_scenario import (
+from crash_coach_pkg.coach.coach import Coach
+from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.fault_scenario import (
     ScenarioPlanner,
     find_fault_scenario,
     load_fault_scenario,
 )
-from crash_coach_pkg.gate_state import GateState
-from crash_coach_pkg.gate_types import Command, Decision
+from crash_coach_pkg.gate.action_gate import GateState
+from crash_coach_pkg.gate.messages import Command, Decision
 
 SEED = 5
 STEPS = 24

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from crash_coach_bringup.cli.evaluate import Layout, Via
-from crash_coach_bringup.cli.faults_play import play
+from crash_coach_bringup.cli.faults.play import play
 from crash_coach_bringup.cli.target import load_target
-from crash_coach_pkg.fault_scenario import load_fault_scenario
+from crash_coach_bringup.cli.verbs.evaluate import Layout, Via
+from crash_coach_pkg.coach.fault_scenario import load_fault_scenario
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 

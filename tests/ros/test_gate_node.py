@@ -11,8 +11,8 @@ import pytest
 from coach_graph import ROBOTS, WAIT_S, graph, process, run_to_end, team
 from crash_coach_interfaces.msg import Action, FaultEvent
 
-from crash_coach_pkg.bits import random_bits
-from crash_coach_pkg.gate import random_available
+from crash_coach_common.keyed_random import random_bits
+from crash_coach_pkg.faults.batch_faults import random_available
 
 AVAILABLE = np.array([[True, True, True, True, False]])
 

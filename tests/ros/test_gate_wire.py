@@ -13,10 +13,11 @@ from crash_coach_interfaces.msg import Action, EpisodeState, FaultEvent, Observa
 from crash_coach_interfaces.msg import CrashPlan as PlanMessage
 from rclpy.serialization import deserialize_message, serialize_message
 
+from crash_coach_common.contract import UserError
 from crash_coach_pkg.faults import mode_code, mode_names
-from crash_coach_pkg.gate_types import Decision, Seen
+from crash_coach_pkg.gate.messages import Decision, Seen
+from crash_coach_pkg.gate.plan_book import Event, EventKind
 from crash_coach_pkg.plan import NEXT_STEP, CrashPlan, Fault, Trigger, TriggerKind
-from crash_coach_pkg.plan_book import Event, EventKind
 from crash_coach_pkg.ros.convert import (
     Played,
     bytes_from_decision,
@@ -30,7 +31,6 @@ from crash_coach_pkg.ros.convert import (
     sight_from_bytes,
     world_from_message,
 )
-from sim_pkg.contract import UserError
 
 
 def command(frame_id: str, fault: int = 0) -> Action:

@@ -14,8 +14,8 @@ from crash_coach_bringup.ros.domain import reserve_domain
 from crash_coach_bringup.ros.graph import UpOptions, check_team, graph_environment, graph_processes
 from crash_coach_bringup.ros.inject import InjectError, InjectResult, clear, inject
 from crash_coach_bringup.ros.supervisor import Supervisor
+from crash_coach_common.contract import UserError
 from policy_pkg.untrained import write_untrained
-from sim_pkg.contract import UserError
 from sim_pkg.env import make_env
 
 WAIT_S = 30.0

@@ -19,11 +19,11 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from crash_coach_bringup.ros.client import GraphClient, graph_client
 from crash_coach_bringup.ros.graph import Node, node_process
+from crash_coach_common.contract import UserError
 from policy_pkg.agent import Answer, Sensed
 from policy_pkg.checkpoint import PolicyBundle, load_policy
 from policy_pkg.ros.convert import bytes_from_answer, sensed_from_bytes
 from policy_pkg.untrained import write_untrained
-from sim_pkg.contract import UserError
 
 
 @pytest.fixture(scope="module")

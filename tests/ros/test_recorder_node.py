@@ -26,16 +26,16 @@ from crash_coach_bringup.ros.graph import (
     ros_arguments,
 )
 from crash_coach_bringup.ros.supervisor import Supervisor
-from crash_coach_pkg.coach import Coach
-from crash_coach_pkg.config import CoachConfig, TeamSpec
+from crash_coach_common.contract import EnvSpec
+from crash_coach_pkg.coach.coach import Coach
+from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from policy_pkg.bags.dataset import RecordedEpisode, load_episodes
 from policy_pkg.bags.problems import Problem
 from policy_pkg.checkpoint import load_policy
+from policy_pkg.episode import Episode
+from policy_pkg.play.rollout import Rollout
 from policy_pkg.ros.recorder_node import PROFILE, PROFILE_VARIABLE
-from policy_pkg.train.bag_dataset import RecordedEpisode, load_episodes
-from policy_pkg.train.episode import Episode
-from policy_pkg.train.rollout import Rollout
 from policy_pkg.untrained import write_untrained
-from sim_pkg.contract import EnvSpec
 from sim_pkg.env import make_env
 
 SEED = 11

@@ -24,8 +24,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from crash_coach_bringup.ros import discovery
 from crash_coach_bringup.ros.domain import reserve_domain
+from crash_coach_common.contract import UserError
 from crash_coach_pkg.ros.command_types import Limits, command_type
-from sim_pkg.contract import UserError
 
 VICTIM, OTHER = ROVERS[0], ROVERS[1]
 TYPE = "geometry_msgs/msg/Twist"

@@ -16,12 +16,12 @@ import pytest
 
 from crash_coach_bringup.cli.main import app, repeat_options
 from crash_coach_bringup.cli.output import CliError
+from crash_coach_common.contract import UserError
 from policy_pkg.checkpoint import load_policy
-from policy_pkg.train.conditions import at_rate, crash_free, exactly
-from policy_pkg.train.evaluate import Evaluation, Scripted
-from policy_pkg.train.evaluate_processes import evaluate_on
+from policy_pkg.play.conditions import at_rate, crash_free, exactly
+from policy_pkg.play.evaluate import Evaluation, Scripted
+from policy_pkg.play.evaluate_processes import evaluate_on
 from policy_pkg.untrained import write_untrained
-from sim_pkg.contract import UserError
 from sim_pkg.env import make_env
 
 SCENARIO = "skirmish/3m"  # returns, lengths and who dies differ from episode to episode
@@ -103,8 +103,8 @@ def test_a_process_that_dies_ends_the_evaluation(checkpoint: Path) -> None:
     code = (
         "from pathlib import Path\n"
         "from policy_pkg.checkpoint import load_policy\n"
-        "from policy_pkg.train.conditions import crash_free\n"
-        "from policy_pkg.train.evaluate_processes import evaluate_on\n"
+        "from policy_pkg.play.conditions import crash_free\n"
+        "from policy_pkg.play.evaluate_processes import evaluate_on\n"
         "if __name__ == '__main__':\n"
         f"    team = load_policy(Path({str(checkpoint)!r}))\n"
         f"    evaluate_on(2, team, {SCENARIO!r}, [crash_free()], 1_000_000, 0)\n"

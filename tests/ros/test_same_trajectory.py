@@ -23,10 +23,10 @@ from fault_files import (
 
 from crash_coach_bringup.ros.evaluation import evaluate_via_ros
 from crash_coach_bringup.ros.graph import Layout
-from crash_coach_pkg.fault_scenario import ScenarioPlanner, load_fault_scenario
+from crash_coach_pkg.coach.fault_scenario import ScenarioPlanner, load_fault_scenario
 from policy_pkg.checkpoint import load_policy
-from policy_pkg.train.conditions import Condition, Planned, at_rate, crash_free, named
-from policy_pkg.train.evaluate import Evaluation, evaluate
+from policy_pkg.play.conditions import Condition, Planned, at_rate, crash_free, named
+from policy_pkg.play.evaluate import Evaluation, evaluate
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 

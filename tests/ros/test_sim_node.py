@@ -15,7 +15,7 @@ from rosgraph_msgs.msg import Clock
 from sim_driver import LEFT, RIGHT, STAY, UP, Driver, Env, end_of, sim
 from visualization_msgs.msg import Marker, MarkerArray
 
-from sim_pkg.contract import BoolArray
+from crash_coach_common.contract import BoolArray
 from sim_pkg.env import make_env
 from sim_pkg.trajectory import TrajectoryHash
 

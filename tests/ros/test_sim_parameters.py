@@ -6,7 +6,7 @@ import pytest
 import rclpy
 from sim_driver import Env, end_of, sim
 
-from sim_pkg.config import ConfigError
+from crash_coach_common.strict_yaml import ConfigError
 from sim_pkg.ros.sim_node import SimNode
 
 

@@ -9,7 +9,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from sim_pkg.contract import UserError
+from crash_coach_common.contract import UserError
 from sim_pkg.env import make_env
 from sim_pkg.ros.convert import (
     EpisodeWriter,

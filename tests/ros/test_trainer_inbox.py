@@ -12,10 +12,10 @@ from crash_coach_interfaces.msg import Action, EpisodeState
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
+from policy_pkg.bags.dataset import RecordedEpisode
 from policy_pkg.bags.topics import Kind
-from policy_pkg.ros.trainer_topics import RobotMessages
-from policy_pkg.train.bag_dataset import RecordedEpisode
-from policy_pkg.train.live_inbox import OPEN_EPISODES, Inbox, Lost
+from policy_pkg.ros.trainer.topics import RobotMessages
+from policy_pkg.train.live.inbox import OPEN_EPISODES, Inbox, Lost
 from sim_pkg.env import make_env
 from sim_pkg.ros.convert import EpisodeWriter, ObservationWriter
 from sim_pkg.session import Session

@@ -20,9 +20,9 @@ from crash_coach_interfaces.msg import EpisodeState
 from crash_coach_bringup.ros.client import graph_client
 from crash_coach_bringup.ros.graph import GraphError, UpOptions
 from crash_coach_bringup.ros.up import run_up
+from crash_coach_common.strict_yaml import ConfigError
 from policy_pkg.checkpoint import CheckpointError
 from policy_pkg.untrained import write_untrained
-from sim_pkg.config import ConfigError
 from sim_pkg.env import make_env
 from sim_pkg.ros.sim_lock import only_sim
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sim_pkg.config import ConfigError
+from crash_coach_common.strict_yaml import ConfigError
 from sim_pkg.env import make_env
 
 

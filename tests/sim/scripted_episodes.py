@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sim_pkg.contract import BoolArray, stay_action
+from crash_coach_common.contract import BoolArray, stay_action
 from sim_pkg.env import Env, make_env
 from sim_pkg.scripted import make_scripted
 from sim_pkg.trajectory import TrajectoryHash

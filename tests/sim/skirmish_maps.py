@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import yaml
 
-from sim_pkg.config import SCENARIOS_DIR, find_scenario, load_yaml_strict
-from sim_pkg.contract import IntArray
+from crash_coach_common.contract import IntArray
+from crash_coach_common.strict_yaml import load_yaml_strict
 from sim_pkg.env import Env
-from sim_pkg.scenarios import skirmish_combat, skirmish_orders
-from sim_pkg.scenarios.skirmish_config import TICK_S, SkirmishConfig, shipped_units
-from sim_pkg.scenarios.skirmish_tables import ATTACK, NEXT_HIT, ORDER, TARGET, Fight, Tables
+from sim_pkg.scenario_files import SCENARIOS_DIR, find_scenario
+from sim_pkg.scenarios.skirmish import combat, orders
+from sim_pkg.scenarios.skirmish.config import TICK_S, SkirmishConfig, shipped_units
+from sim_pkg.scenarios.skirmish.tables import ATTACK, NEXT_HIT, ORDER, TARGET, Fight, Tables
 
 Placed = tuple[str, float, float]
 
@@ -69,7 +70,7 @@ class Duel:
         d = self.bodies.shape[1]
         hits = np.zeros((1, d, d), dtype=np.float32)
         t, f = self.tables, self.fight
-        skirmish_combat.fight(
+        combat.fight(
             self.running, 1, TICK_S, self.bodies, t.units, t.hits_s, t.damage, t.reach_m,
             f.extras_s, f.clock_s, f.real, f.whole, hits,
         )  # fmt: skip
@@ -79,14 +80,14 @@ class Duel:
         """(d, 2) the velocities that a phase begins with."""
         t, f = self.tables, self.fight
         commands = np.zeros((1, self.bodies.shape[1], 2))
-        skirmish_orders.drive(
+        orders.drive(
             self.running, self.n, self.phase_s, self.bodies, t.units, t.reach_m, t.acquire_m,
             t.leash_m, self.habits, t.goal_m, f.real, f.whole, commands,
         )  # fmt: skip
         return commands[0]
 
     def order(self, actions: list[int]) -> None:
-        skirmish_orders.take_orders(
+        orders.take_orders(
             self.running, np.array([actions], dtype=np.int32), self.bodies, self.fight.real,
             self.fight.whole,
         )  # fmt: skip

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
-from sim_pkg.config import SCENARIOS_DIR
 from sim_pkg.env import Env, make_env
+from sim_pkg.scenario_files import SCENARIOS_DIR
 
 UP, DOWN, LEFT, RIGHT, STAY = range(5)
 

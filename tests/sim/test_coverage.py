@@ -10,8 +10,8 @@ import yaml
 from bad_files import check_refused
 from scripted_episodes import play
 
-from sim_pkg.config import SCENARIOS_DIR
 from sim_pkg.env import Env, make_env
+from sim_pkg.scenario_files import SCENARIOS_DIR
 from sim_pkg.scripted import make_scripted
 
 STAY, EAST = 0, 1

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from sim_pkg.contract import BatchEnv
+from crash_coach_common.contract import BatchEnv
 from sim_pkg.env import Env, make_env, scenario_names
 from sim_pkg.trajectory import TrajectoryHash, combine
 

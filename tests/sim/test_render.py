@@ -13,11 +13,11 @@ from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 from PIL import Image, ImageSequence
 
-from sim_pkg.frames import Actor, Frames, Side
-from sim_pkg.render import Panel, Track, draw_trajectories
-from sim_pkg.render_stage import CRASHED, HEALTH, HIT, SHIELD, SIDE_COLOURS
-from sim_pkg.render_still import draw_still
-from sim_pkg.render_video import GIF_FPS, LAST_S, MP4_FPS, write_video
+from sim_pkg.render.comparison import Panel, Track, draw_trajectories
+from sim_pkg.render.film import GIF_FPS, LAST_S, MP4_FPS, write_video
+from sim_pkg.render.frames import Actor, Frames, Side
+from sim_pkg.render.stage import CRASHED, HEALTH, HIT, SHIELD, SIDE_COLOURS
+from sim_pkg.render.still import draw_still
 from sim_pkg.scenarios.base import Scene
 
 GREEN, ORANGE = "#2a9d4a", "#e07b00"
@@ -204,6 +204,6 @@ def test_a_file_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_drawing_needs_no_display() -> None:
-    code = "import matplotlib, sim_pkg.render_still, sim_pkg.render_video, sys; "
+    code = "import matplotlib, sim_pkg.render.still, sim_pkg.render.film, sys; "
     code += "sys.exit('matplotlib.pyplot' in sys.modules)"
     assert subprocess.run(["python", "-c", code], timeout=60).returncode == 0

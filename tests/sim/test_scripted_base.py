@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scripted_episodes import play
 
-from sim_pkg.config import ConfigError
+from crash_coach_common.strict_yaml import ConfigError
 from sim_pkg.env import make_env, scenario_names
 from sim_pkg.scripted import make_scripted, scripted_names
 

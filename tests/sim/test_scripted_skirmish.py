@@ -11,7 +11,7 @@ import pytest
 from scripted_episodes import play
 
 from sim_pkg.env import Env, make_env
-from sim_pkg.scenarios.skirmish_layout import (
+from sim_pkg.scenarios.skirmish.layout import (
     EAST,
     FIRST_ATTACK,
     NO_OP,

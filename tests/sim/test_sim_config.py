@@ -8,8 +8,9 @@ import pytest
 from bad_files import check_refused
 from pydantic import Field
 
-from sim_pkg.config import SCENARIOS_DIR, ConfigError, StrictModel, load_yaml_strict
+from crash_coach_common.strict_yaml import ConfigError, StrictModel, load_yaml_strict
 from sim_pkg.env import make_env, scenario_names
+from sim_pkg.scenario_files import SCENARIOS_DIR
 
 GOOD = (SCENARIOS_DIR / "buttons.yaml").read_text()
 STARTS = "  - [2, 1]\n  - [7, 8]\n"

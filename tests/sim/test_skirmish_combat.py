@@ -9,8 +9,8 @@ import pytest
 from skirmish_maps import Duel, Placed, load_map, write_map
 
 from sim_pkg.env import make_env
-from sim_pkg.scenarios.skirmish_layout import FIRST_ATTACK, STATE_COOLDOWN, STOP
-from sim_pkg.scenarios.skirmish_tables import ALIVE, CHASE, HEALTH, HITTER, HURT, READY, SHIELD
+from sim_pkg.scenarios.skirmish.layout import FIRST_ATTACK, STATE_COOLDOWN, STOP
+from sim_pkg.scenarios.skirmish.tables import ALIVE, CHASE, HEALTH, HITTER, HURT, READY, SHIELD
 
 TICK_S = 1 / 16
 FAR = ("dummy", 30.0, 30.0)

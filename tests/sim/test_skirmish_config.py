@@ -9,9 +9,10 @@ import pytest
 import yaml
 from bad_files import check_refused
 
-from sim_pkg.config import SCENARIOS_DIR, ConfigError, scenario_names
+from crash_coach_common.strict_yaml import ConfigError
 from sim_pkg.env import make_env
-from sim_pkg.scenarios.skirmish_config import shipped_units
+from sim_pkg.scenario_files import SCENARIOS_DIR, scenario_names
+from sim_pkg.scenarios.skirmish.config import shipped_units
 
 GOOD = (SCENARIOS_DIR / "skirmish" / "3m.yaml").read_text()
 LINES = GOOD.splitlines()

@@ -11,8 +11,8 @@ import pytest
 from skirmish_maps import Placed, load_map, random_actions, write_map
 
 from sim_pkg.env import Env, make_env
-from sim_pkg.scenarios.skirmish_config import SkirmishConfig
-from sim_pkg.scenarios.skirmish_layout import FIRST_ATTACK, NO_OP, STOP
+from sim_pkg.scenarios.skirmish.config import SkirmishConfig
+from sim_pkg.scenarios.skirmish.layout import FIRST_ATTACK, NO_OP, STOP
 from sim_pkg.scripted.base import make_scripted
 from sim_pkg.trajectory import TrajectoryHash, combine
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim_pkg.scenarios.skirmish_layout import FIRST_ATTACK, Layout
+from sim_pkg.scenarios.skirmish.layout import FIRST_ATTACK, Layout
 
 SHIELDED = ("stalker", "zealot")
 

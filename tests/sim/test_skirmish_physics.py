@@ -9,10 +9,10 @@ import pytest
 import yaml
 from skirmish_maps import load_map, random_actions, write_map
 
-from sim_pkg.config import SCENARIOS_DIR
 from sim_pkg.env import Env, make_env
-from sim_pkg.scenarios.skirmish import Skirmish
-from sim_pkg.scenarios.skirmish_layout import FIRST_ATTACK, NORTH, SOUTH
+from sim_pkg.scenario_files import SCENARIOS_DIR
+from sim_pkg.scenarios.skirmish.layout import FIRST_ATTACK, NORTH, SOUTH
+from sim_pkg.scenarios.skirmish.rules import Skirmish
 from sim_pkg.scripted.base import make_scripted
 from sim_pkg.world import World
 

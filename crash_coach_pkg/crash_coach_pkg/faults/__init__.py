@@ -8,6 +8,7 @@ from importlib.metadata import EntryPoint, entry_points
 
 from pydantic import ValidationError
 
+from crash_coach_common.contract import UserError
 from crash_coach_pkg.faults.adversarial import Adversarial
 from crash_coach_pkg.faults.base import (
     CommandFault,
@@ -27,7 +28,6 @@ from crash_coach_pkg.faults.random import Random
 from crash_coach_pkg.faults.scale import Scale
 from crash_coach_pkg.faults.schema import parameters_of
 from crash_coach_pkg.faults.stale import Stale
-from sim_pkg.contract import UserError
 
 ENTRY_POINT_GROUP = "crash_coach.faults"
 SYNONYMS = {"stay": "mute"}

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict
 
-from crash_coach_pkg.bits import random_bits
-from sim_pkg.contract import FloatArray
+from crash_coach_common.contract import FloatArray
+from crash_coach_common.keyed_random import random_bits
 
 C = TypeVar("C")
 Vector = npt.NDArray[np.float64]

@@ -6,8 +6,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from crash_coach_common.contract import FloatArray
 from crash_coach_pkg.faults.base import ObservationFault, Step
-from sim_pkg.contract import FloatArray
 
 
 class Blind(ObservationFault):

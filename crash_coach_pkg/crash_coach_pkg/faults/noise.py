@@ -7,8 +7,8 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
+from crash_coach_common.contract import FloatArray
 from crash_coach_pkg.faults.base import FaultParameters, ObservationFault, Step
-from sim_pkg.contract import FloatArray
 
 _STREAM = 3
 

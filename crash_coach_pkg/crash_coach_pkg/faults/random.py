@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from crash_coach_pkg.faults.base import C, CommandFault, Need, Step, Tools
 
-_STREAM = 0  # the batched fast path (crash_coach_pkg.gate) draws from the same
+_STREAM = 0  # the batched fast path (crash_coach_pkg.faults.batch_faults) draws from the same
 
 
 class Random(CommandFault[C]):

@@ -12,7 +12,9 @@ from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.node import Node
 
-from crash_coach_pkg.control import Control
+from crash_coach_common.contract import UserError
+from crash_coach_common.ros.run_node import BLOCKS, EPISODE, EVENTS, PLAN, TICK_S
+from crash_coach_pkg.coach.live_coach import Control
 from crash_coach_pkg.plan import CrashPlan
 from crash_coach_pkg.ros.convert import (
     Played,
@@ -20,8 +22,6 @@ from crash_coach_pkg.ros.convert import (
     plan_from_message,
     played_from_bytes,
 )
-from crash_coach_pkg.ros.run import BLOCKS, EPISODE, EVENTS, PLAN, TICK_S
-from sim_pkg.contract import UserError
 
 ARM_TIMEOUT_S = 2.0
 HEARTBEATS_PER_LEASE = 3

@@ -26,15 +26,18 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from crash_coach_pkg.coach import Planner
-from crash_coach_pkg.config import TeamSpec
-from crash_coach_pkg.control import Control, ControlSettings
-from crash_coach_pkg.fault_scenario import (
+from crash_coach_common.contract import UserError
+from crash_coach_common.ros.parameters import CheckedParameterService
+from crash_coach_common.ros.run_node import SPIN_S, refuse_unknown_parameters, spin
+from crash_coach_pkg.coach.coach import Planner
+from crash_coach_pkg.coach.config import TeamSpec
+from crash_coach_pkg.coach.fault_scenario import (
     ScenarioPlanner,
     find_fault_scenario,
     load_fault_scenario,
 )
-from crash_coach_pkg.parameters import (
+from crash_coach_pkg.coach.live_coach import Control, ControlSettings
+from crash_coach_pkg.coach.parameters import (
     START_SPECS,
     ParameterSpec,
     Value,
@@ -46,9 +49,7 @@ from crash_coach_pkg.parameters import (
     parameter_specs,
 )
 from crash_coach_pkg.ros.coach_link import CoachLink
-from crash_coach_pkg.ros.run import SPIN_S, refuse_unknown_parameters, robot_names, spin
-from sim_pkg.contract import UserError
-from sim_pkg.ros.parameter_service import CheckedParameterService
+from crash_coach_pkg.ros.robot_names import robot_names
 
 
 class CoachNode(Node):

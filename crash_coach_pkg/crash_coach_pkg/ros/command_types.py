@@ -15,9 +15,9 @@ import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.serialization import deserialize_message, serialize_message
 
-from crash_coach_pkg.bits import random_bits
+from crash_coach_common.contract import UserError
+from crash_coach_common.keyed_random import random_bits
 from crash_coach_pkg.faults.base import Need, Vector
-from sim_pkg.contract import UserError
 
 _LINEAR_X, _LINEAR_Y, _ANGULAR_Z = 0, 1, 5  # places in a vector
 

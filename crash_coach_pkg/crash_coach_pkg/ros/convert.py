@@ -18,13 +18,13 @@ from crash_coach_interfaces.msg import EpisodeState, FaultEvent
 from crash_coach_interfaces.msg import Fault as FaultMessage
 from std_msgs.msg import Header
 
+from crash_coach_common.contract import UserError
 from crash_coach_pkg.effects import NO_ACTION
 from crash_coach_pkg.faults import fault_mode, mode_code
-from crash_coach_pkg.gate_types import Command, Decision, Seen, Sight
+from crash_coach_pkg.gate.messages import Command, Decision, Seen, Sight
+from crash_coach_pkg.gate.plan_book import TEAM, Event
 from crash_coach_pkg.plan import NEXT_STEP, CrashPlan, Fault, Trigger, TriggerKind
-from crash_coach_pkg.plan_book import TEAM, Event
 from crash_coach_pkg.schedule import World
-from sim_pkg.contract import UserError
 
 # Encapsulation (4 bytes), stamp (8), length of frame_id (4), frame_id, padding to 4, fields.
 _LITTLE_ENDIAN = b"\x00\x01"

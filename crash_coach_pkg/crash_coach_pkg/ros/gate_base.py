@@ -15,14 +15,15 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from crash_coach_pkg.health import Decided, Report, RobotState, TeamHealth
+from crash_coach_common.contract import UserError
+from crash_coach_common.ros.parameters import CheckedParameterService
+from crash_coach_common.ros.run_node import EVENTS, PLAN, TICK_S, refuse_unknown_parameters
+from crash_coach_pkg.gate.health import Decided, Report, RobotState, TeamHealth
+from crash_coach_pkg.gate.plan_book import Event, EventKind, PlanBook
 from crash_coach_pkg.plan import CrashPlan
-from crash_coach_pkg.plan_book import Event, EventKind, PlanBook
 from crash_coach_pkg.ros.convert import message_from_event, message_from_plan, plan_from_message
 from crash_coach_pkg.ros.endpoints import WatchedPublisher
-from crash_coach_pkg.ros.run import EVENTS, PLAN, TICK_S, refuse_unknown_parameters, robot_names
-from sim_pkg.contract import UserError
-from sim_pkg.ros.parameter_service import CheckedParameterService
+from crash_coach_pkg.ros.robot_names import robot_names
 
 ACTION_TYPE = "crash_coach_interfaces/msg/Action"
 DIAGNOSTICS_S = 1.0

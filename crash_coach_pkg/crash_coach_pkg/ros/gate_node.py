@@ -13,12 +13,14 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
+from crash_coach_common.contract import UserError
+from crash_coach_common.ros.run_node import EPISODE, NEWEST, spin
 from crash_coach_pkg.effects import WITHHELD
-from crash_coach_pkg.gate_state import GateState
-from crash_coach_pkg.gate_types import Decision, Outputs, Seen
-from crash_coach_pkg.health import Decided
+from crash_coach_pkg.gate.action_gate import GateState
+from crash_coach_pkg.gate.health import Decided
+from crash_coach_pkg.gate.messages import Decision, Outputs, Seen
+from crash_coach_pkg.gate.plan_book import PlanBook
 from crash_coach_pkg.plan import CrashPlan
-from crash_coach_pkg.plan_book import PlanBook
 from crash_coach_pkg.ros.convert import (
     bytes_from_decision,
     bytes_from_seen,
@@ -29,8 +31,6 @@ from crash_coach_pkg.ros.convert import (
 )
 from crash_coach_pkg.ros.gate_base import ACTION_TYPE, Gate, GateBase
 from crash_coach_pkg.ros.relay_node import RelayGate
-from crash_coach_pkg.ros.run import EPISODE, NEWEST, spin
-from sim_pkg.contract import UserError
 
 
 class ActionGate:

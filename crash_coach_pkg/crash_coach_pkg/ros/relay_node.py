@@ -12,14 +12,14 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
-from crash_coach_pkg.health import Decided
+from crash_coach_common.contract import UserError
+from crash_coach_pkg.gate.health import Decided
+from crash_coach_pkg.gate.plan_book import PlanBook
+from crash_coach_pkg.gate.relay_gate import Outputs, Relay, Sent
 from crash_coach_pkg.plan import CrashPlan
-from crash_coach_pkg.plan_book import PlanBook
-from crash_coach_pkg.relay import Outputs, Relay, Sent
 from crash_coach_pkg.ros.command_types import Limits, command_type
 from crash_coach_pkg.ros.endpoints import Offer, offered
 from crash_coach_pkg.ros.gate_base import GateBase
-from sim_pkg.contract import UserError
 
 _MATCH = "match"
 _RELIABILITY = {

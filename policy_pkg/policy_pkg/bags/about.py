@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sim_pkg.contract import UserError
+from crash_coach_common.contract import UserError
 
 RECORD = "crash_coach"
 """Name of the MCAP metadata record."""

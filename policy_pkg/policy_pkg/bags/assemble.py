@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from crash_coach_common.contract import BoolArray, FloatArray, IntArray
 from policy_pkg.bags.decode import Decodes
 from policy_pkg.bags.join import Key, Pieces
 from policy_pkg.bags.topics import Kind
-from sim_pkg.contract import BoolArray, FloatArray, IntArray
 
 UNKNOWN = -1
 _SHOWN = 3  # of the missing things

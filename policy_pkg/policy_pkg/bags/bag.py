@@ -8,11 +8,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from crash_coach_common.contract import UserError
 from policy_pkg.bags.about import About, about_from_record
 from policy_pkg.bags.problems import BagError, Problem, Report
 from policy_pkg.bags.records import Channel, ChannelTable, Entry, channels_of, entries
 from policy_pkg.bags.topics import kind_of
-from sim_pkg.contract import UserError
 
 
 @dataclass(frozen=True)

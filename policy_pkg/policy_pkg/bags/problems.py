@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
-from sim_pkg.contract import UserError
+from crash_coach_common.contract import UserError
 
 
 class Severity(Enum):

@@ -17,7 +17,7 @@ from rosbags.interfaces import (
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from sim_pkg.contract import UserError
+from crash_coach_common.contract import UserError
 
 INTERFACES = "crash_coach_interfaces"
 EPISODE_TOPIC = "/sim/episode"

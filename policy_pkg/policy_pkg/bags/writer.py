@@ -12,9 +12,9 @@ from typing import Any, BinaryIO
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys.store import Typestore
 
+from crash_coach_common.contract import UserError
 from policy_pkg.bags.about import RECORD, About
 from policy_pkg.bags.topics import Connection
-from sim_pkg.contract import UserError
 
 COMPRESSIONS = {
     "zstd": CompressionType.ZSTD,

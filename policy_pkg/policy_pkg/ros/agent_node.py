@@ -21,13 +21,13 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
+from crash_coach_common.contract import UserError
 from policy_pkg.act import Exploration, greedy, least_valued
 from policy_pkg.agent import Agent
 from policy_pkg.checkpoint import CheckpointError, load_policy
 from policy_pkg.ros.agent_params import PolicyParameters, TeamParameters, read_parameters
 from policy_pkg.ros.convert import bytes_from_answer, sensed_from_bytes
 from policy_pkg.ros.weights_link import Receive, WeightsLink
-from sim_pkg.contract import UserError
 
 NEWEST = QoSProfile(depth=1)  # reliable: an observation or command replaces the one before
 SPIN_S = 0.1  # how soon a signal is noticed

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pydantic import BaseModel, ConfigDict, Field
 from rclpy.node import Node
 
+from crash_coach_common.contract import UserError
 from policy_pkg.ros.node_params import read_model, require
-from sim_pkg.contract import UserError
 
 _WITHOUT_LIVE = ("checkpoint", "epsilon", "exploration_seed")
 

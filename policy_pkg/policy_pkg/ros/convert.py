@@ -12,8 +12,8 @@ import struct
 
 import numpy as np
 
+from crash_coach_common.contract import UserError
 from policy_pkg.agent import Answer, Sensed
-from sim_pkg.contract import UserError
 
 # Encapsulation (4 bytes), stamp (8), length of frame_id (4), frame_id, padding to 4.
 _ENCAPSULATION = b"\x00\x01"

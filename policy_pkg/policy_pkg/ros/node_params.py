@@ -5,8 +5,8 @@ from __future__ import annotations
 from pydantic import BaseModel
 from rclpy.node import Node
 
-from sim_pkg.contract import UserError
-from sim_pkg.ros.parameter_service import (
+from crash_coach_common.contract import UserError
+from crash_coach_common.ros.parameters import (
     CheckedParameterService,
     Model,
     declare_model,

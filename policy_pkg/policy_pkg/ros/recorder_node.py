@@ -25,12 +25,12 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
+from crash_coach_common.contract import UserError
 from policy_pkg.bags.about import About
 from policy_pkg.bags.recorder import Recorder
 from policy_pkg.bags.topics import INTERFACES, Connection, connections, load_typestore
 from policy_pkg.bags.writer import BagWriter, Split
 from policy_pkg.ros.recorder_params import RecorderParameters, read_parameters
-from sim_pkg.contract import UserError
 
 PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 PROFILE = Path(__file__).with_name("recorder_fastdds.xml")

@@ -8,8 +8,8 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 from rclpy.node import Node
 
+from crash_coach_common.contract import UserError
 from policy_pkg.ros.node_params import read_model, require
-from sim_pkg.contract import UserError
 
 _NOT_TOLD = -1
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")

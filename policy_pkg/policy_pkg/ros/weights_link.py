@@ -8,9 +8,9 @@ from crash_coach_interfaces.msg import PolicyStatus, PolicyWeights
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
+from crash_coach_common.contract import UserError
 from policy_pkg.agent import Answer, Sensed
 from policy_pkg.live_weights import LiveAgent, Weights
-from sim_pkg.contract import UserError
 
 WEIGHTS_TOPIC = "/trainer/weights"
 STATUS_TOPIC = "/trainer/policies"

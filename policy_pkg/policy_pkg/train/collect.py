@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 from policy_pkg.checkpoint import AGENT, BEST, CHECKPOINTS, MANIFEST, list_checkpoints
-from policy_pkg.train.results import steps_of, wanted_steps
+from policy_pkg.report.finished_runs import steps_of, wanted_steps
 from policy_pkg.train.run_dir import METRICS, RUN, TIMING, RunError, read_run
 
 AGENT_FILES = (f"{AGENT}.safetensors", MANIFEST)

@@ -11,10 +11,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from crash_coach_pkg.config import CoachConfig
-from policy_pkg.train.learner_config import LearnerConfig
-from policy_pkg.train.strata import Strata
-from sim_pkg.config import (
+from crash_coach_common.strict_yaml import (
     ConfigError,
     YamlTree,
     did_you_mean,
@@ -23,6 +20,9 @@ from sim_pkg.config import (
     shipped_names,
     validate,
 )
+from crash_coach_pkg.coach.config import CoachConfig
+from policy_pkg.learner.config import LearnerConfig
+from policy_pkg.learner.strata import Strata
 
 CONFIGS_DIR = Path(__file__).parent.parent / "configs"
 OFFLINE = "offline"  # its folder is that of `train-offline`

@@ -33,8 +33,8 @@ target_mean          mean TD target, likewise
 updates_per_episode  gradient steps per finished episode, as configured
 ===================  ==========================================================================
 
-With test_victim_episodes there is a key ``success_R_crashed`` for each robot R: the success rate with
-it alone crashed.
+With test_victim_episodes there is a key ``success_R_crashed`` for each robot R: the success rate
+with it alone crashed.
 
 ``timing.jsonl`` has one line per block as well: env_steps, wall_s (seconds since this process
 began training) and steps_per_s (environment steps per second since the last block, evaluation
@@ -48,7 +48,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from sim_pkg.contract import UserError
+from crash_coach_common.contract import UserError
 
 Value = str | int | float | None
 

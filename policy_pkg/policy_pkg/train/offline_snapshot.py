@@ -11,7 +11,7 @@ from policy_pkg.checkpoint import (
     read_tensors,
     write_checkpoint,
 )
-from policy_pkg.train.offline_session import OfflineSession
+from policy_pkg.train.offline.session import OfflineSession
 from policy_pkg.train.run_dir import checkpoint_path
 from policy_pkg.train.snapshot import KEEP_LAST, Logged
 

@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from crash_coach_common.contract import UserError
 from policy_pkg.train.config import TrainConfig
+from policy_pkg.train.run import Clock, ProgressReport, train
 from policy_pkg.train.session import Block, Session
-from policy_pkg.train.trainer import Clock, ProgressReport, train
-from sim_pkg.contract import UserError
 from sim_pkg.env import Env
 
 REST = "rest"

@@ -25,11 +25,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from crash_coach_common.contract import UserError
 from policy_pkg.checkpoint import CHECKPOINTS
 from policy_pkg.kernels import kernels
 from policy_pkg.train.config import TrainConfig
-from policy_pkg.train.offline_config import OfflineConfig
-from sim_pkg.contract import UserError
+from policy_pkg.train.offline.config import OfflineConfig
 
 RUN = "run.json"
 METRICS = "metrics.jsonl"

@@ -7,22 +7,22 @@ from typing import Any
 
 import numpy as np
 
-from crash_coach_pkg.action_tools import ACTION_OFFERS
-from crash_coach_pkg.coach import BlockRecord, Coach
-from crash_coach_pkg.config import TeamSpec
+from crash_coach_common.contract import BatchEnv, EnvSpec, UserError
+from crash_coach_pkg.coach.coach import BlockRecord, Coach
+from crash_coach_pkg.coach.config import TeamSpec
+from crash_coach_pkg.coach.strategies import Progress
 from crash_coach_pkg.faults import unmet_needs
+from crash_coach_pkg.faults.action_tools import ACTION_OFFERS
 from crash_coach_pkg.plan import CrashPlan
-from crash_coach_pkg.strategies import Progress
+from policy_pkg.episode import Sizes
+from policy_pkg.learner.learner import Learner
+from policy_pkg.learner.replay import Replay
+from policy_pkg.play.conditions import Condition, crash_free, named
+from policy_pkg.play.evaluate import Evaluation, evaluate_in
+from policy_pkg.play.rollout import Finished, Rollout
 from policy_pkg.policy import RecurrentPolicy
-from policy_pkg.train.conditions import Condition, crash_free, named
 from policy_pkg.train.config import TrainConfig
-from policy_pkg.train.episode import Sizes
-from policy_pkg.train.evaluate import Evaluation, evaluate_in
-from policy_pkg.train.learner import Learner
 from policy_pkg.train.metrics import Means, Value
-from policy_pkg.train.replay import Replay
-from policy_pkg.train.rollout import Finished, Rollout
-from sim_pkg.contract import BatchEnv, EnvSpec, UserError
 
 TEST_ARENAS = 32
 _TEST_KEY = 0x7E57

@@ -14,7 +14,7 @@ from policy_pkg.checkpoint import (
     read_tensors,
     write_checkpoint,
 )
-from policy_pkg.train.live_session import LiveSession
+from policy_pkg.train.live.session import LiveSession
 from policy_pkg.train.metrics import Value
 from policy_pkg.train.run_dir import checkpoint_path
 from policy_pkg.train.session import Counters, Session

@@ -11,7 +11,14 @@ setup(
     maintainer="Crash Coach engineers",
     maintainer_email="team@crash-coach.dev",
     license="Apache-2.0",
-    packages=["crash_coach_bringup", "crash_coach_bringup.cli", "crash_coach_bringup.ros"],
+    packages=[
+        "crash_coach_bringup",
+        "crash_coach_bringup.cli",
+        "crash_coach_bringup.cli.faults",
+        "crash_coach_bringup.cli.report",
+        "crash_coach_bringup.cli.verbs",
+        "crash_coach_bringup.ros",
+    ],
     package_data={},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),

@@ -11,9 +11,9 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 
-from sim_pkg.contract import BoolArray, FloatArray
+from crash_coach_common.contract import BoolArray, FloatArray
 from sim_pkg.env import Env
-from sim_pkg.frames import actors, vitals, walled_m
+from sim_pkg.render.frames import actors, vitals, walled_m
 from sim_pkg.session import Session
 
 ARENA_TOPIC = "/sim/arena"

@@ -24,10 +24,10 @@ from nav_msgs.msg import Odometry
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from sim_pkg.contract import EnvSpec, UserError
-from sim_pkg.frames import Side, actors, vitals
+from crash_coach_common.contract import EnvSpec, UserError
 from sim_pkg.lockstep import Decisions, Health
 from sim_pkg.realtime import NewestCommands
+from sim_pkg.render.frames import Side, actors, vitals
 from sim_pkg.scenarios.base import Scene
 from sim_pkg.session import Session
 

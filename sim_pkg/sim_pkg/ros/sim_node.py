@@ -17,8 +17,8 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
-from sim_pkg.config import ConfigError
-from sim_pkg.contract import UserError
+from crash_coach_common.contract import UserError
+from crash_coach_common.strict_yaml import ConfigError
 from sim_pkg.env import make_env
 from sim_pkg.lockstep import Decisions
 from sim_pkg.pause import Pause

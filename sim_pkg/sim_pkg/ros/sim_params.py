@@ -7,12 +7,12 @@ from typing import Literal
 from pydantic import ConfigDict, Field
 from rclpy.node import Node
 
-from sim_pkg.config import ConfigError, StrictModel, did_you_mean
-from sim_pkg.ros.parameter_service import (
+from crash_coach_common.ros.parameters import (
     CheckedParameterService,
     declare_model,
     unknown_parameter,
 )
+from crash_coach_common.strict_yaml import ConfigError, StrictModel, did_you_mean
 
 
 class SimParameters(StrictModel):

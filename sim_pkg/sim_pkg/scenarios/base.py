@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from sim_pkg.config import StrictModel
-from sim_pkg.contract import BoolArray, EnvSpec, FloatArray, IntArray, RewardArray
+from crash_coach_common.contract import BoolArray, EnvSpec, FloatArray, IntArray, RewardArray
+from crash_coach_common.strict_yaml import StrictModel
 from sim_pkg.world import Float64Array, World, WorldSpec
 
 # What every kind's configuration may say; beyond these, numbers overflow or memory ends.

@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 from pydantic import Field, model_validator
 
-from sim_pkg.config import StrictModel
-from sim_pkg.contract import BoolArray, EnvSpec, IntArray
+from crash_coach_common.contract import BoolArray, EnvSpec, IntArray
+from crash_coach_common.strict_yaml import StrictModel
 from sim_pkg.scenarios.base import (
     Buffers,
     EpisodeLimit,

@@ -27,8 +27,8 @@ import numpy as np
 from numba import njit
 from pydantic import Field, model_validator
 
-from sim_pkg.config import Misplaced
-from sim_pkg.contract import BoolArray, IntArray
+from crash_coach_common.contract import BoolArray, IntArray
+from crash_coach_common.strict_yaml import Misplaced
 from sim_pkg.scenarios import drive
 from sim_pkg.scenarios.base import Buffers, Kind, Scene, episode_rng
 from sim_pkg.scenarios.drive import DrivenConfig, Metres, Point, clip

@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 from pydantic import Field
 
-from sim_pkg.config import Misplaced, StrictModel
-from sim_pkg.contract import EnvSpec
+from crash_coach_common.contract import EnvSpec
+from crash_coach_common.strict_yaml import Misplaced, StrictModel
 from sim_pkg.scenarios.base import (
     EpisodeLimit,
     MassKg,

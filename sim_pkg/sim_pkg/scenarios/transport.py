@@ -34,8 +34,8 @@ import numpy as np
 from numba import njit
 from pydantic import Field, model_validator
 
-from sim_pkg.config import Misplaced, StrictModel
-from sim_pkg.contract import BoolArray, IntArray
+from crash_coach_common.contract import BoolArray, IntArray
+from crash_coach_common.strict_yaml import Misplaced, StrictModel
 from sim_pkg.scenarios import drive
 from sim_pkg.scenarios.base import Buffers, Kind, MassKg, Scene, episode_rng
 from sim_pkg.scenarios.drive import DrivenConfig, Metres, Point, clip

@@ -15,8 +15,15 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from sim_pkg.config import ConfigError, StrictModel, did_you_mean
-from sim_pkg.contract import BoolArray, EnvSpec, EpisodeArray, FloatArray, IntArray, stay_action
+from crash_coach_common.contract import (
+    BoolArray,
+    EnvSpec,
+    EpisodeArray,
+    FloatArray,
+    IntArray,
+    stay_action,
+)
+from crash_coach_common.strict_yaml import ConfigError, StrictModel, did_you_mean
 from sim_pkg.env import Env
 
 # Keeps a policy's random numbers apart from the environment's of the same (seed, episode).

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from sim_pkg.contract import BoolArray, EnvSpec, EpisodeArray, FloatArray, IntArray
+from crash_coach_common.contract import BoolArray, EnvSpec, EpisodeArray, FloatArray, IntArray
 from sim_pkg.scenarios import drive
 from sim_pkg.scenarios.coverage import CoverageConfig
 from sim_pkg.scripted.base import Entry

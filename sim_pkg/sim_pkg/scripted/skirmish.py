@@ -18,9 +18,9 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from sim_pkg.contract import BoolArray, EnvSpec, EpisodeArray, FloatArray, IntArray
-from sim_pkg.scenarios.skirmish_config import SkirmishConfig
-from sim_pkg.scenarios.skirmish_layout import (
+from crash_coach_common.contract import BoolArray, EnvSpec, EpisodeArray, FloatArray, IntArray
+from sim_pkg.scenarios.skirmish.config import SkirmishConfig
+from sim_pkg.scenarios.skirmish.layout import (
     DISTANCE,
     DX,
     DY,
@@ -30,7 +30,7 @@ from sim_pkg.scenarios.skirmish_layout import (
     STOP,
     VISIBLE,
 )
-from sim_pkg.scenarios.skirmish_tables import (
+from sim_pkg.scenarios.skirmish.tables import (
     COOLDOWN_S,
     EXTRA_S,
     MAX_HEALTH,

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from sim_pkg.scenarios.skirmish_layout import (
+from sim_pkg.scenarios.skirmish.layout import (
     ATTACKABLE,
     DISTANCE,
     DX,
@@ -19,7 +19,7 @@ from sim_pkg.scenarios.skirmish_layout import (
     SIGHT_M,
     STOP,
 )
-from sim_pkg.scenarios.skirmish_orders import WAYS
+from sim_pkg.scenarios.skirmish.orders import WAYS
 
 # SEEN: 1 or 0. CAN: an attack may be ordered. LEFT: health and shield together.
 SEEN, CAN, X, Y, AWAY, LEFT, VIEW_COLUMNS = range(7)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs, urlsplit
 
-from sim_pkg.contract import UserError
+from crash_coach_common.contract import UserError
 
 COOKIE = "crash_coach_token"
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")

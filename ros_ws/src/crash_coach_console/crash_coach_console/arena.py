@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sim_pkg.frames import Frames
+from sim_pkg.render.frames import Frames
 
 _PLACES = 3  # decimals of metres and radians: a millimetre
 

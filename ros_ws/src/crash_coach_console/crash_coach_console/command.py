@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
+from crash_coach_common.contract import UserError
 from crash_coach_console.access import Access
 from crash_coach_console.serve import PORT, serve
 from crash_coach_console.source import Source
-from sim_pkg.contract import UserError
 
 
 def console(

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from policy_pkg.train.statistics import mean_interval, wilson
+from policy_pkg.statistics import mean_interval, wilson
 
 SETTLE_S = 0.5
 """How long after an episode's end events of it are still awaited."""

@@ -7,11 +7,11 @@ import json
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Any
 
+from crash_coach_common.contract import UserError
 from crash_coach_console.board import Cursor
 from crash_coach_console.modes import modes_value
 from crash_coach_console.requests import RequestError, parse_request
 from crash_coach_console.source import Source
-from sim_pkg.contract import UserError
 
 PACE_S = 1 / 30
 """A page is told of what is new this often, at most."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from crash_coach_pkg.parameters import NOBODY, Value, parameter_specs
-from sim_pkg.contract import UserError
+from crash_coach_common.contract import UserError
+from crash_coach_pkg.coach.parameters import NOBODY, Value, parameter_specs
 
 AT_START = ("robots", "roles", "dt_s", "fault_scenario", "follow_sim")
 WATCHED = (*AT_START, *(spec.name for spec in parameter_specs()))

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from crash_coach_common.contract import UserError
 from crash_coach_pkg.plan import NEXT_STEP
-from sim_pkg.contract import UserError
 
 MOST_BYTES = 16_384
 MOST_ROBOTS = 256

@@ -9,10 +9,10 @@ from contextlib import ExitStack, contextmanager
 from types import FrameType
 from urllib.parse import urlencode
 
+from crash_coach_common.contract import UserError
 from crash_coach_console.access import Access
 from crash_coach_console.server import Server, make_app
 from crash_coach_console.source import Source
-from sim_pkg.contract import UserError
 
 PORT = 8642
 

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from crash_coach_bringup.cli.output import CliError
-from policy_pkg.train.results import read_text
+from policy_pkg.report.finished_runs import read_text
 from policy_pkg.train.run_dir import METRICS, RUN, read_run, seedless_name
 
 MAX_RANGE_SEEDS = 4

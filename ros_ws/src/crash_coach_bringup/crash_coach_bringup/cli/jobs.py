@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from crash_coach_bringup.cli.output import console
-from sim_pkg.contract import UserError
+from crash_coach_common.contract import UserError
 
 if TYPE_CHECKING:
     from multiprocessing.process import BaseProcess
@@ -48,7 +48,7 @@ def _work(index: int, job: Job, parent: int, out: Queue[Message]) -> None:
     """A training process; ends by itself where its parent is gone."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     # Imported here: only training processes need torch.
-    from policy_pkg.train.trainer import train
+    from policy_pkg.train.run import train
 
     def report(progress: Any) -> None:
         if os.getppid() != parent:

@@ -7,29 +7,29 @@ import sys
 
 import typer
 
-from crash_coach_bringup.cli import (
+from crash_coach_bringup.cli.faults import verb as faults
+from crash_coach_bringup.cli.multi_value import expand
+from crash_coach_bringup.cli.report import verb as report
+from crash_coach_bringup.cli.verbs import (
     bags,
     calibrate,
     collect,
     demo,
     doctor,
     evaluate,
-    faults,
     inject,
     plot,
     profile,
     record,
     render,
-    report,
     sweep,
     train,
     train_live,
     train_offline,
     up,
 )
-from crash_coach_bringup.cli.several import expand
+from crash_coach_common.contract import UserError
 from crash_coach_console.command import console
-from sim_pkg.contract import UserError
 
 app = typer.Typer(
     name="crash-coach",
@@ -61,7 +61,7 @@ app.command("calibrate")(calibrate.calibrate)
 
 
 def repeat_options(arguments: list[str]) -> list[str]:
-    """The command line as typer reads it. Raises CliError as ``several.expand``."""
+    """The command line as typer reads it. Raises CliError as ``multi_value.expand``."""
     return expand(arguments, typer.main.get_command(app))
 
 

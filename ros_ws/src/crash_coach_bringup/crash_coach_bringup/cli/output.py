@@ -11,7 +11,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from sim_pkg.contract import UserError
+from crash_coach_common.contract import UserError
 
 console = Console()
 

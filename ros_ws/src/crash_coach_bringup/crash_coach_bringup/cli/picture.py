@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from policy_pkg.checkpoint import PolicyBundle
-from policy_pkg.train.conditions import Condition
-from policy_pkg.train.evaluate import Evaluation, record
-from sim_pkg.render import Panel, Track, draw_trajectories
+from policy_pkg.play.conditions import Condition
+from policy_pkg.play.evaluate import Evaluation, record
+from sim_pkg.render.comparison import Panel, Track, draw_trajectories
 
 
 @dataclass(frozen=True)

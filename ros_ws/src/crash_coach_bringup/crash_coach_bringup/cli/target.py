@@ -7,7 +7,7 @@ from pathlib import Path
 
 from crash_coach_bringup.cli.output import CliError
 from policy_pkg.checkpoint import PolicyBundle, load_policy
-from policy_pkg.train.evaluate import Scripted
+from policy_pkg.play.evaluate import Scripted
 from sim_pkg.env import make_env
 
 SCRIPTED = "scripted:"

@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 from crash_coach_bringup.ros.discovery import use_quick_discovery
-from sim_pkg.contract import UserError
+from crash_coach_common.contract import UserError
 
 SPIN_S = 0.05
 ASK_AGAIN_S = 0.3

@@ -12,11 +12,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
 
 from crash_coach_bringup.ros.client import GraphClient
-from crash_coach_pkg.coach import Planner
+from crash_coach_common.contract import UserError
+from crash_coach_pkg.coach.coach import Planner
 from crash_coach_pkg.effects import EffectKind, EffectRow
 from crash_coach_pkg.schedule import Schedule, World
-from policy_pkg.train.evaluate import EpisodeResult
-from sim_pkg.contract import UserError
+from policy_pkg.play.evaluate import EpisodeResult
 from sim_pkg.trajectory import CourseHash
 
 START_S = 60.0  # until the sim serves /sim/reset; a cold start compiles the book-keeping
@@ -187,7 +187,7 @@ class Collector:
 
 
 def _course_hash(states: list[EpisodeState]) -> str:
-    """As policy_pkg.train.evaluate makes it, of all states of an episode."""
+    """As policy_pkg.play.evaluate makes it, of all states of an episode."""
     course = CourseHash()
     for before, after in pairwise(states):
         course.observe(np.asarray(before.state, dtype=np.float32))

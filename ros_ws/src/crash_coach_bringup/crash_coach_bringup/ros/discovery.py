@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 
-from sim_pkg.contract import UserError
+from crash_coach_common.contract import UserError
 
 VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 

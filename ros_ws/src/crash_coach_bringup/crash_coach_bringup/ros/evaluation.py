@@ -1,4 +1,4 @@
-"""Evaluation over ROS: the same episodes as policy_pkg.train.evaluate, played by a real graph."""
+"""Evaluation over ROS: the same episodes as policy_pkg.play.evaluate, played by a real graph."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from crash_coach_bringup.ros.graph import (
     graph_processes,
 )
 from crash_coach_bringup.ros.supervisor import Supervisor
-from crash_coach_pkg.action_tools import ACTION_OFFERS
-from crash_coach_pkg.coach import Coach, Planner
-from crash_coach_pkg.config import CoachConfig, TeamSpec
-from crash_coach_pkg.fault_scenario import ScenarioPlanner, load_fault_scenario
+from crash_coach_common.contract import UserError
+from crash_coach_pkg.coach.coach import Coach, Planner
+from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.fault_scenario import ScenarioPlanner, load_fault_scenario
 from crash_coach_pkg.faults import unmet_needs
-from policy_pkg.train.conditions import Condition
-from policy_pkg.train.evaluate import Evaluation
-from sim_pkg.contract import UserError
+from crash_coach_pkg.faults.action_tools import ACTION_OFFERS
+from policy_pkg.play.conditions import Condition
+from policy_pkg.play.evaluate import Evaluation
 
 
 def evaluate_via_ros(
@@ -41,7 +41,7 @@ def evaluate_via_ros(
     """Plays episodes 0 .. ``episodes`` - 1 in lock-step on a ROS domain of its own.
 
     ``condition``: crashes of a coach, or a fault scenario's file. Equal arguments give the results
-    of policy_pkg.train.evaluate.evaluate with effects, bit for bit. The nodes' logs go to
+    of policy_pkg.play.evaluate.evaluate with effects, bit for bit. The nodes' logs go to
     ``log_dir``; None: to a temporary folder that is kept after an error.
 
     Raises:

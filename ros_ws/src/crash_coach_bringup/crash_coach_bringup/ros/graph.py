@@ -12,11 +12,11 @@ from typing import Literal
 
 from crash_coach_bringup.ros import discovery
 from crash_coach_bringup.ros.probe import find_executable
-from crash_coach_pkg.config import CoachConfig, FaultConfig, TeamSpec
-from crash_coach_pkg.fault_scenario import load_fault_scenario
+from crash_coach_common.contract import UserError
+from crash_coach_pkg.coach.config import CoachConfig, FaultConfig, TeamSpec
+from crash_coach_pkg.coach.fault_scenario import load_fault_scenario
 from crash_coach_pkg.faults import check_parameters, fault_mode, is_observation_mode
 from policy_pkg.checkpoint import load_policy
-from sim_pkg.contract import UserError
 from sim_pkg.env import make_env
 
 Mode = Literal["lockstep", "realtime"]
@@ -151,7 +151,7 @@ def check_team(options: UpOptions) -> TeamSpec:
     """Loads scenario and checkpoint and returns the team.
 
     Raises:
-        sim_pkg.config.ConfigError: no such scenario.
+        crash_coach_common.strict_yaml.ConfigError: no such scenario.
         policy_pkg.checkpoint.CheckpointError: no usable checkpoint, or one of another team.
     """
     spec = make_env(options.scenario, 1).spec

@@ -11,11 +11,12 @@ from rclpy.parameter_client import AsyncParameterClient
 from std_srvs.srv import Trigger
 
 from crash_coach_bringup.ros.client import GraphClient, graph_client
+from crash_coach_common.contract import UserError
 from crash_coach_pkg.faults import check_parameters
 from crash_coach_pkg.injection import describe, injection
-from sim_pkg.contract import UserError
 
 COACH = "/coach"
+
 
 class InjectError(UserError):
     """Nothing was changed; the text is the reason."""

@@ -15,9 +15,9 @@ from rclpy.exceptions import ParameterException
 from rclpy.experimental import EventsExecutor
 from rclpy.signals import SignalHandlerOptions
 
+from crash_coach_common.contract import UserError
 from crash_coach_pkg.ros import coach_node, gate_node
 from policy_pkg.ros.team_node import TeamNode
-from sim_pkg.contract import UserError
 from sim_pkg.ros.sim_lock import SecondSimError, only_sim
 from sim_pkg.ros.sim_node import SimNode
 

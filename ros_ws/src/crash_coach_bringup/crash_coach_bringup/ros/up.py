@@ -28,7 +28,7 @@ def run_up(options: UpOptions, on_event: Callable[[Event], None]) -> int:
     Raises:
         GraphError: a checkpoint that does not fit, a missing executable, a bad domain, or a
             sim that already runs on the domain.
-        sim_pkg.config.ConfigError, policy_pkg.checkpoint.CheckpointError: as check_team.
+        ConfigError, CheckpointError: as check_team.
         OSError: a log cannot be written.
     """
     domain = domain_id(options)

@@ -11,11 +11,11 @@ from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue
 from rclpy.parameter import Parameter, parameter_value_to_python
 
+from crash_coach_common.contract import UserError
 from crash_coach_console.arena import Arena, State, pairs
 from crash_coach_console.team import Plan, PlannedFault
-from crash_coach_pkg.parameters import Value
+from crash_coach_pkg.coach.parameters import Value
 from crash_coach_pkg.plan import NEXT_STEP, TriggerKind
-from sim_pkg.contract import UserError
 
 KINDS = {
     FaultEvent.ARMED: "armed",

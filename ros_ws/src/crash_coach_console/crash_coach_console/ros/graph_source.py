@@ -14,6 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from std_srvs.srv import SetBool, Trigger
 
+from crash_coach_common.contract import UserError
 from crash_coach_console.board import Board
 from crash_coach_console.episodes import Costs, EpisodeBook
 from crash_coach_console.operating import (
@@ -36,9 +37,8 @@ from crash_coach_console.ros import convert
 from crash_coach_console.ros.graph_link import GraphLink
 from crash_coach_console.source import Kind
 from crash_coach_console.team import LiveTeam
+from crash_coach_pkg.coach.parameters import Value
 from crash_coach_pkg.injection import describe, injection
-from crash_coach_pkg.parameters import Value
-from sim_pkg.contract import UserError
 
 POLL_S = 1.0
 SHOW_S = 0.2

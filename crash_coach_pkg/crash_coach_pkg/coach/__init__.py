@@ -1,0 +1,1 @@
+"""Who crashes, when and how; and how the crash rate moves."""

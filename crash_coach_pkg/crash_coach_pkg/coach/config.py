@@ -1,0 +1,270 @@
+"""The coach's settings: one schema for training, evaluation, the coach node and the docs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal, Self
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+
+from crash_coach_common.contract import EnvSpec, UserError
+from crash_coach_pkg.coach.strategies import is_strategy, strategy_names
+from crash_coach_pkg.faults import check_parameters, fault_mode
+from crash_coach_pkg.plan import NEXT_STEP
+
+CapRule = Literal["ceil", "floor", "authors"]
+FURTHEST_M = 1e6
+HIGHEST_RETURN = 1e9
+HIGHEST_HAZARD_HZ = 1000.0
+Coordinate = Annotated[float, Field(ge=-FURTHEST_M, le=FURTHEST_M)]
+
+
+@dataclass(frozen=True)
+class TeamSpec:
+    """Whom faults can concern.
+
+    ``roles``: one for each robot, or empty where nobody has one. ``dt_s``: length of a control
+    step; None: unknown.
+
+    Raises:
+        UserError: names that are not distinct ROS names, a wrong number of roles, or dt_s <= 0.
+    """
+
+    robots: tuple[str, ...]
+    roles: tuple[str, ...] = ()
+    dt_s: float | None = None
+
+    def __post_init__(self) -> None:
+        check_robots(self.robots)
+        if self.roles and len(self.roles) != len(self.robots):
+            raise UserError(
+                f"roles {list(self.roles)}: {len(self.roles)} for {len(self.robots)} robots; "
+                "one for each robot is needed, or none at all"
+            )
+        if self.dt_s is not None and not 0 < self.dt_s < float("inf"):
+            raise UserError(f"dt_s {self.dt_s}: the length of a control step is positive")
+
+    @classmethod
+    def of(cls, spec: EnvSpec) -> TeamSpec:
+        """The team that plays a scenario."""
+        return cls(spec.robots, spec.roles, spec.dt_s)
+
+    @property
+    def n(self) -> int:
+        return len(self.robots)
+
+    def of_role(self, role: str) -> tuple[int, ...]:
+        """Indexes of the robots of ``role``; '': of all."""
+        return tuple(i for i in range(self.n) if not role or self.roles[i : i + 1] == (role,))
+
+
+class FaultConfig(BaseModel):
+    """One fault: whom it concerns, when, and how.
+
+    Whom: ``victims``, or ``crashed_exactly`` of the candidates, or every candidate; candidates are
+    the robots of ``victim_role``, or all. When: from ``start_step`` on, for ``duration_steps``; or
+    whenever from then on a hazard or condition strikes (one of them at most).
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    crash_mode: str = Field(
+        default="mute",
+        description="What happens to a crashed robot: a mode of docs/faults.md, such as mute (no "
+        "command arrives, it stays; stay is the paper's word) or random (a uniform command).",
+    )
+    crash_parameters: dict[str, float] = Field(
+        default_factory=dict, description="Parameters of crash_mode; the rest has its default."
+    )
+    victims: tuple[str, ...] = Field(
+        default=(), description="Robots that crash in every episode; empty: victims are drawn."
+    )
+    victim_role: str = Field(
+        default="", description="Draw among the robots of this role only; empty: among all."
+    )
+    crashed_exactly: int = Field(
+        default=-1, ge=-1, description="Exactly this many random victims in every episode; -1: off."
+    )
+    start_step: int = Field(
+        default=0, ge=0, lt=NEXT_STEP, description="First control step that can be faulted."
+    )
+    duration_steps: int = Field(
+        default=0,
+        ge=0,
+        lt=NEXT_STEP,
+        description="Faulted control steps; 0: until the episode ends.",
+    )
+    hazard_rate_hz: float = Field(
+        default=0.0,
+        ge=0,
+        le=HIGHEST_HAZARD_HZ,
+        description="Faults per second and candidate, at random steps, again after each recovery; "
+        "0: off.",
+    )
+    near_point_m: tuple[Coordinate, Coordinate] = Field(
+        default=(0.0, 0.0),
+        description="Point x, y in the map frame, metres, that near_radius_m is about.",
+    )
+    near_radius_m: float = Field(
+        default=0.0,
+        ge=0,
+        le=FURTHEST_M,
+        description="Fault a candidate once it is this near to near_point_m, metres; 0: off.",
+    )
+    return_above: float | None = Field(
+        default=None,
+        gt=-HIGHEST_RETURN,
+        le=HIGHEST_RETURN,
+        description="Fault the candidates once the episode's return exceeds this; null: off.",
+    )
+    max_crashed: int = Field(
+        default=-1, ge=-1, description="Never crash more robots than this; -1: no further limit."
+    )
+    min_alive: int = Field(
+        default=0, ge=0, description="Never leave fewer working robots than this."
+    )
+
+    @property
+    def triggered(self) -> bool:
+        """Whether a hazard or a condition starts the fault."""
+        return self.hazard_rate_hz > 0 or self.near_radius_m > 0 or self.return_above is not None
+
+    @field_validator("crash_mode")
+    @classmethod
+    def _known_mode(cls, name: str) -> str:
+        fault_mode(name)
+        return name
+
+    @field_validator("crash_parameters")
+    @classmethod
+    def _known_parameters(
+        cls, parameters: dict[str, float], info: ValidationInfo
+    ) -> dict[str, float]:
+        if "crash_mode" in info.data:  # otherwise that is what is wrong
+            check_parameters(info.data["crash_mode"], parameters)
+        return parameters
+
+    @field_validator("victims")
+    @classmethod
+    def _distinct_victims(cls, victims: tuple[str, ...]) -> tuple[str, ...]:
+        twice = sorted({name for name in victims if victims.count(name) > 1})
+        if twice:
+            raise ValueError(f"victims names {', '.join(twice)} more than once")
+        return victims
+
+    @model_validator(mode="after")
+    def _one_way_to_choose(self) -> Self:
+        if self.victims and self.crashed_exactly >= 0:
+            raise ValueError(
+                f"victims {list(self.victims)} and crashed_exactly {self.crashed_exactly} "
+                "contradict each other; use one of them"
+            )
+        if self.victims and self.victim_role:
+            raise ValueError(
+                f"victims {list(self.victims)} and victim_role {self.victim_role!r} contradict "
+                "each other; use one of them"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _one_trigger(self) -> Self:
+        given = {
+            "hazard_rate_hz": self.hazard_rate_hz if self.hazard_rate_hz > 0 else None,
+            "near_radius_m": self.near_radius_m if self.near_radius_m > 0 else None,
+            "return_above": self.return_above,
+        }
+        asked = [f"{name} {value}" for name, value in given.items() if value is not None]
+        if len(asked) > 1:
+            raise ValueError(f"{' and '.join(asked)} contradict each other; use one of them")
+        if any(self.near_point_m) and not self.near_radius_m:
+            raise ValueError(
+                f"near_point_m {list(self.near_point_m)} has no effect without near_radius_m"
+            )
+        return self
+
+
+class CoachConfig(FaultConfig):
+    """Who crashes, how often and how.
+
+    Precedence of the victims: strategy ``none`` crashes nobody; ``victims`` crash in every
+    episode; ``crashed_exactly`` draws that many in every episode; otherwise the crash rate draws.
+    With a hazard or condition and a fixed rate of 0, every candidate is a victim.
+    """
+
+    strategy: str = Field(
+        default="none",
+        description="How the crash rate moves: none, fixed, curriculum, adaptive, or own.",
+    )
+    crash_rate: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Crash rate alpha of strategy fixed, per robot and episode.",
+    )
+    beta: float = Field(
+        default=0.75,
+        ge=0,
+        le=1,
+        description="Adaptive: success rate from which the crash rate rises.",
+    )
+    rho: float = Field(
+        default=0.01,
+        gt=0,
+        le=1,
+        description="Adaptive: share of the way moved per evaluation block.",
+    )
+    alpha_max: float | None = Field(
+        default=None,
+        ge=0,
+        le=1,
+        description="Highest crash rate; null: 0.1 for curriculum, 1.0 for adaptive.",
+    )
+    curriculum_fraction: float = Field(
+        default=0.5,
+        gt=0,
+        le=1,
+        description="Curriculum: part of training after which alpha_max is reached.",
+    )
+    curriculum_delta: float | None = Field(
+        default=None,
+        gt=0,
+        le=1,
+        description="Curriculum: increment per episode instead of curriculum_fraction; null: off.",
+    )
+    resample: bool = Field(
+        default=True, description="Discard draws with more crashed robots than cap_rule allows."
+    )
+    cap_rule: CapRule = Field(
+        default="ceil",
+        description="Most robots of n that crash at rate a: ceil (n a), floor (n a, the paper), "
+        "authors (n - round(n (1 - a)), the authors' code).",
+    )
+
+    @field_validator("strategy")
+    @classmethod
+    def _known_strategy(cls, name: str) -> str:
+        if not is_strategy(name):
+            known = ", ".join(strategy_names())
+            raise ValueError(f"unknown coaching strategy {name!r}; one of: {known}")
+        return name
+
+
+def check_robots(names: Sequence[str]) -> tuple[str, ...]:
+    """A team's names. Raises UserError unless they are distinct and fit for topic names."""
+    if not names:
+        raise UserError("robots is empty; name at least one robot")
+    for name in names:
+        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name):
+            raise UserError(f"robot name {name!r} is not a valid ROS name (letters, digits, _)")
+        if list(names).count(name) > 1:
+            raise UserError(f"robots names {name!r} more than once")
+    return tuple(names)

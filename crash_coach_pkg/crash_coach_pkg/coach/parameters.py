@@ -1,0 +1,293 @@
+"""The coach node's parameters: one table for descriptors, checks and docs, without ROS.
+
+Everything comes from the fields of ControlSettings and CoachConfig and the schemas of the fault
+modes; what a ROS parameter cannot say (null, an empty list) has a stated value instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+
+from crash_coach_common.contract import UserError
+from crash_coach_pkg.coach.config import FURTHEST_M, HIGHEST_RETURN, CoachConfig, TeamSpec
+from crash_coach_pkg.coach.draws import check_team
+from crash_coach_pkg.coach.live_coach import ControlSettings
+from crash_coach_pkg.coach.strategies import ADAPTIVE_ALPHA_MAX, CURRICULUM_ALPHA_MAX
+from crash_coach_pkg.faults import SYNONYMS, check_parameters, fault_mode, mode_names
+
+Value = bool | int | float | str | Sequence[str] | Sequence[float]
+NOBODY = "none"
+NO_CEILING = -1.0
+NO_RETURN = -HIGHEST_RETURN
+UINT32_MAX = 2**32 - 1
+
+# Fraction and delta need the length of training; a graph has curriculum_episodes instead. Modes'
+# parameters have a ROS parameter each.
+_NOT_IN_A_GRAPH = ("curriculum_fraction", "curriculum_delta", "crash_parameters", "coach")
+
+
+@dataclass(frozen=True)
+class ParameterSpec:
+    """``low`` and ``high`` are inclusive; None where there is no numeric range."""
+
+    name: str
+    default: Value
+    description: str
+    low: float | None = None
+    high: float | None = None
+    read_only: bool = False
+
+
+SPECIAL = {
+    "strategy": ParameterSpec(
+        "strategy",
+        "fixed",
+        "How the crash rate moves: none, fixed, curriculum, adaptive, or an installed one.",
+    ),
+    "victims": ParameterSpec(
+        "victims",
+        (NOBODY,),
+        "Robots that crash in every episode; ['none']: victims are drawn by crash_rate (an empty "
+        "list has no type in ROS and is refused).",
+    ),
+    "alpha_max": ParameterSpec(
+        "alpha_max",
+        NO_CEILING,
+        f"Highest crash rate; -1: {CURRICULUM_ALPHA_MAX} for curriculum, {ADAPTIVE_ALPHA_MAX} for "
+        "adaptive.",
+        -1.0,
+        1.0,
+    ),
+    "return_above": ParameterSpec(
+        "return_above",
+        NO_RETURN,
+        f"Fault the candidates once the episode's return exceeds this; {NO_RETURN:g}: off.",
+        NO_RETURN,
+        HIGHEST_RETURN,
+    ),
+}
+CURRICULUM_EPISODES = ParameterSpec(
+    "curriculum_episodes",
+    1000,
+    "Curriculum: finished episodes after which alpha_max is reached.",
+    1,
+    1_000_000_000,
+)
+START_SPECS = (
+    ParameterSpec(
+        "roles",
+        (NOBODY,),
+        "Role of each robot, in the order of robots; ['none']: nobody has one.",
+        read_only=True,
+    ),
+    ParameterSpec(
+        "dt_s",
+        0.0,
+        "Length of a control step, seconds; 0: unknown, then hazards are refused.",
+        0.0,
+        60.0,
+        read_only=True,
+    ),
+    ParameterSpec(
+        "fault_scenario",
+        "",
+        "A fault scenario, by name or path of its YAML file, that decides who crashes, when and "
+        "how; empty: the parameters do.",
+        read_only=True,
+    ),
+    ParameterSpec(
+        "follow_sim",
+        True,
+        "Follow the episodes of /sim; false: one endless episode 0, for robots without our sim.",
+        read_only=True,
+    ),
+)
+"""Fixed at start."""
+BESIDE_A_SCENARIO = frozenset(("enabled", "apply_at", "lease_s"))
+"""What can still be set where a fault scenario decides the rest."""
+
+
+def parameter_specs() -> tuple[ParameterSpec, ...]:
+    """Every parameter of the coach node that can change while it runs."""
+    return (*_specs(ControlSettings), *_specs(CoachConfig), CURRICULUM_EPISODES, *mode_specs())
+
+
+def mode_specs() -> Iterator[ParameterSpec]:
+    """``<mode>.<name>`` for each parameter of each known mode."""
+    for mode in mode_names():
+        for name, field in fault_mode(mode).Parameters.model_fields.items():
+            low, high = _bounds(field)
+            unit = unit_of(field)
+            text = f"crash_mode {mode}: {field.description}" + (f" [{unit}]" if unit != "1" else "")
+            # ROS knows a type by the default.
+            default = float(field.default) if field.annotation is float else field.default
+            yield ParameterSpec(f"{mode}.{name}", default, text, low, high)
+
+
+def unit_of(field: FieldInfo) -> str:
+    """Of a mode's parameter; "1" where it has none."""
+    extra = field.json_schema_extra
+    return str(extra.get("unit", "1")) if isinstance(extra, dict) else "1"
+
+
+def _specs(model: type[BaseModel]) -> Iterator[ParameterSpec]:
+    for name, field in model.model_fields.items():
+        if name in SPECIAL:
+            yield SPECIAL[name]
+        elif name not in _NOT_IN_A_GRAPH:
+            low, high = _bounds(field)
+            yield ParameterSpec(name, field.default, str(field.description), low, high)
+
+
+def _bounds(field: FieldInfo) -> tuple[float | None, float | None]:
+    """The range in ROS' terms: inclusive, so an open end is left to the check afterwards."""
+    low: float | None = None
+    high: float | None = None
+    for limit in field.metadata:
+        low = getattr(limit, "ge", getattr(limit, "gt", low))
+        if hasattr(limit, "lt"):
+            high = limit.lt - 1
+        high = getattr(limit, "le", high)
+    if isinstance(field.default, int) and low is not None and high is None:
+        high = UINT32_MAX
+    return low, high
+
+
+def build_team(values: Mapping[str, Value], robots: tuple[str, ...]) -> TeamSpec:
+    """The team from the values of START_SPECS. Raises UserError as TeamSpec."""
+    roles = _names("roles", values["roles"])
+    dt_s = _number(values["dt_s"])
+    return TeamSpec(robots, roles, dt_s or None)
+
+
+def build_settings(values: Mapping[str, Value], team: TeamSpec) -> ControlSettings:
+    """The whole configuration from a value for every parameter.
+
+    Raises:
+        UserError: naming the parameter, its value and what would be right.
+    """
+    alpha_max = _number(values["alpha_max"])
+    if alpha_max != NO_CEILING and alpha_max < 0:
+        raise UserError(f"alpha_max {alpha_max}: 0 to 1, or -1 for the strategy's own")
+    ceiling = CURRICULUM_ALPHA_MAX if alpha_max == NO_CEILING else alpha_max
+    return_above = _number(values["return_above"])
+    coach: dict[str, Any] = {
+        **{name: values[name] for name in CoachConfig.model_fields if name in values},
+        "victims": _names("victims", values["victims"]),
+        "alpha_max": None if alpha_max == NO_CEILING else alpha_max,
+        # Where alpha_max is 0, any increment ends there.
+        "curriculum_delta": ceiling / _number(values["curriculum_episodes"]) or 1.0,
+        "return_above": None if return_above == NO_RETURN else return_above,
+        "near_point_m": _point(values),
+        "crash_parameters": _mode_parameters(values),
+    }
+    own: dict[str, Any] = {
+        name: values[name] for name in ControlSettings.model_fields if name in values
+    }
+    try:
+        config = CoachConfig(**coach)
+        settings = ControlSettings(**own, coach=config)
+    except ValidationError as error:
+        raise UserError(_reasons(error)) from None
+    check_team(config, team)
+    return settings
+
+
+def _mode_parameters(values: Mapping[str, Value]) -> dict[str, float]:
+    """Those of the chosen mode. The others are checked too: choosing their mode must not fail."""
+    by_mode: dict[str, dict[str, float]] = {name: {} for name in mode_names()}
+    for name in values:
+        mode, dot, parameter = name.partition(".")
+        if dot:
+            by_mode[mode][parameter] = _number(values[name])
+    for mode, parameters in by_mode.items():
+        check_parameters(mode, parameters)
+    chosen = str(values["crash_mode"])
+    return by_mode.get(SYNONYMS.get(chosen, chosen), {})  # an unknown one is CoachConfig's to name
+
+
+def _point(values: Mapping[str, Value]) -> tuple[float, ...]:
+    """near_point_m, checked, and (0, 0) while it is off: it is set before the radius, or after."""
+    value = values["near_point_m"]
+    point = () if isinstance(value, str | bool | int | float) else tuple(map(_number, value))
+    if len(point) != 2 or not all(abs(x) <= FURTHEST_M for x in point):
+        raise UserError(
+            f"near_point_m {list(point)}: x and y in metres, within {FURTHEST_M:g} of the origin"
+        )
+    return point if _number(values["near_radius_m"]) else (0.0, 0.0)
+
+
+# When they change, the running episode need not be planned again.
+NOT_IN_PLAN = frozenset(
+    ("apply_at", "lease_s", "block_episodes", "curriculum_episodes", "success_from")
+)
+
+
+def counts_now(settings: ControlSettings, changed: Collection[str], endless: bool) -> bool:
+    """Whether a change concerns the running episode; in an ``endless`` one there is no next."""
+    mode = fault_mode(settings.coach.crash_mode).name
+    of_plan = [
+        name
+        for name in changed
+        if name not in NOT_IN_PLAN and ("." not in name or name.startswith(f"{mode}."))
+    ]
+    return bool(of_plan) and (endless or settings.apply_at == "next_step")
+
+
+WHOM = ("victims", "crashed_exactly", "hazard_rate_hz", "near_radius_m", "return_above")
+
+
+def check_change(settings: ControlSettings, changed: Sequence[str]) -> None:
+    """Raises UserError for a change that asks for victims while nobody can crash."""
+    coach = settings.coach
+    asked = [name for name in WHOM if name in changed]
+    if not asked or not (coach.victims or coach.crashed_exactly > 0 or coach.triggered):
+        return
+    if not settings.enabled:
+        raise UserError(
+            f"{asked[0]} would have no effect: enabled is false (as /coach/clear_all leaves it); "
+            "set enabled to true first, or in the same call"
+        )
+    if coach.strategy == "none":
+        raise UserError(f"{asked[0]} would have no effect: strategy is none; set fixed, for one")
+
+
+def check_beside(scenario: str, changed: Sequence[str]) -> None:
+    """Raises UserError for a change that a fault scenario leaves without effect."""
+    known = {spec.name for spec in parameter_specs()}
+    for name in changed:
+        if scenario and name in known and name not in BESIDE_A_SCENARIO:
+            raise UserError(
+                f"{name} would have no effect: fault_scenario {scenario} decides who crashes, when "
+                f"and how; only {', '.join(sorted(BESIDE_A_SCENARIO))} can be set"
+            )
+
+
+def _names(key: str, value: Value) -> tuple[str, ...]:
+    """A list of names, of which ['none'] is the empty one."""
+    if isinstance(value, str | bool | int | float) or not all(isinstance(n, str) for n in value):
+        raise UserError(f"{key} {value!r} is not a list of names")
+    names = tuple(str(name) for name in value)
+    if NOBODY in names and len(names) > 1:
+        raise UserError(f"{key} {list(names)}: {NOBODY!r} stands alone")
+    return () if names == (NOBODY,) else names
+
+
+def _number(value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise UserError(f"{value!r} is not a number")
+    return float(value)
+
+
+def _reasons(error: ValidationError) -> str:
+    reasons = []
+    for detail in error.errors():
+        where = ".".join(str(part) for part in detail["loc"])
+        text = detail["msg"].removeprefix("Value error, ")
+        reasons.append(f"{where} {detail['input']!r}: {text}" if where else text)
+    return "; ".join(reasons)

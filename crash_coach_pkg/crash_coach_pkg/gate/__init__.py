@@ -1,0 +1,1 @@
+"""What the gate decides of every command that passes it."""

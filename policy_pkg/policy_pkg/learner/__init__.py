@@ -1,0 +1,1 @@
+"""How a team learns: nets, loss, replay. The only room with torch."""

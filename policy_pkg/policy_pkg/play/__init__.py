@@ -1,0 +1,1 @@
+"""Episodes: rollouts for training, greedy ones under crashes, teams of any origin."""

@@ -1,0 +1,70 @@
+"""Under which crashes a team is evaluated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+from crash_coach_pkg.coach.coach import Planner
+from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.faults import fault_mode
+
+Parameters = Mapping[str, float]
+NO_PARAMETERS: Parameters = MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Under which crashes of a coach a policy is evaluated.
+
+    ``drawn``: whether victims or effects may be drawn in each episode.
+    """
+
+    name: str
+    crash: CoachConfig
+    drawn: bool = True
+
+
+@dataclass(frozen=True)
+class Planned:
+    """Crashes that something else than a coach plans, such as a fault scenario.
+
+    ``planner``: for a team and the evaluation's seed; raises UserError where it cannot.
+    """
+
+    name: str
+    planner: Callable[[TeamSpec, int], Planner]
+    drawn: ClassVar[bool] = True  # it may
+
+
+def crash_free() -> Condition:
+    return Condition("crash-free", CoachConfig(), drawn=False)
+
+
+def at_rate(rate: float, mode: str = "mute", parameters: Parameters = NO_PARAMETERS) -> Condition:
+    """Every robot crashes on its own with probability ``rate``; no re-sampling (the paper's)."""
+    who = {"crash_rate": rate, "resample": False}
+    return _fixed(f"rate {rate:g}", who, mode, parameters, drawn=0 < rate < 1)
+
+
+def exactly(count: int, mode: str = "mute", parameters: Parameters = NO_PARAMETERS) -> Condition:
+    """``count`` uniformly drawn robots crash in every episode."""
+    return _fixed(f"{count} crashed", {"crashed_exactly": count}, mode, parameters, drawn=count > 0)
+
+
+def named(
+    victims: Sequence[str], mode: str = "mute", parameters: Parameters = NO_PARAMETERS
+) -> Condition:
+    """These robots crash in every episode."""
+    return _fixed(f"{', '.join(victims)} {mode}", {"victims": tuple(victims)}, mode, parameters)
+
+
+def _fixed(
+    name: str, who: dict[str, Any], mode: str, parameters: Parameters, drawn: bool = False
+) -> Condition:
+    """``drawn``: whether the victims are."""
+    how = {"strategy": "fixed", "crash_mode": mode, "crash_parameters": dict(parameters)}
+    crash = CoachConfig.model_validate({**how, **who})
+    return Condition(name, crash, drawn or fault_mode(mode).draws)

@@ -1,0 +1,1 @@
+"""Many finished runs under the same episodes: methods over seeds and maps."""

@@ -1,0 +1,1 @@
+"""Training over ROS: the graph plays, the trainer learns."""

@@ -1,0 +1,1 @@
+"""`crash-coach faults`: what faults there are, and fault scenarios judged."""

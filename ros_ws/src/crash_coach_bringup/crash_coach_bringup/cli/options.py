@@ -1,0 +1,87 @@
+"""Options that say who crashes and how, and the conditions that they ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated
+
+import typer
+
+from crash_coach_bringup.cli.output import CliError
+from crash_coach_common.contract import UserError
+from crash_coach_pkg.faults import check_parameters, fault_mode
+from policy_pkg.play.conditions import Condition, at_rate, crash_free, exactly, named
+
+CrashedOption = Annotated[
+    list[int] | None, typer.Option(help="K ...: exactly K robots crash, drawn anew each episode.")
+]
+ModeOption = Annotated[
+    str,
+    typer.Option(
+        help="What happens to a crashed robot: mute (or stay: it stands still), random, delay or "
+        "any other mode of docs/faults.md."
+    ),
+]
+ParamOption = Annotated[
+    list[str] | None,
+    typer.Option(help="NAME=VALUE ...: parameters of the mode, such as steps=3 of delay."),
+]
+
+
+def mode_parameters(mode: str, given: list[str]) -> dict[str, float]:
+    """The values of ``--param``, checked against ``--mode``.
+
+    Raises:
+        CliError: names the option, its value and what would be right.
+    """
+    try:
+        fault_mode(mode)
+    except UserError as error:
+        raise CliError(f"--mode {mode}: {error}") from None
+    parameters: dict[str, float] = {}
+    for text in given:
+        name, equals, value = text.partition("=")
+        if not equals or not name:
+            raise CliError(f"--param {text}: NAME=VALUE is needed, such as steps=3")
+        if name in parameters:
+            raise CliError(f"--param {text}: {name} is given more than once")
+        try:
+            parameters[name] = float(value)
+        except ValueError:
+            raise CliError(f"--param {text}: {value!r} is not a number") from None
+    try:
+        check_parameters(mode, parameters)
+    except UserError as error:
+        raise CliError(f"--param: {error}") from None
+    return parameters
+
+
+def conditions(
+    robots: tuple[str, ...],
+    rates: list[float],
+    crashed: list[int],
+    victims: list[str],
+    mode: str,
+    parameters: Mapping[str, float],
+) -> list[Condition]:
+    """What to evaluate under, in the order rates, counts, victims; crash-free without any.
+
+    ``parameters``: of the mode, as ``mode_parameters`` returns them.
+
+    Raises:
+        CliError: names the option, its value and what would be right.
+    """
+    for rate in rates:
+        if not 0 <= rate <= 1:
+            raise CliError(f"--crash-rate {rate}: a probability from 0 to 1 is needed")
+    for count in crashed:
+        if not 0 <= count <= len(robots):
+            raise CliError(f"--crashed {count}: the team has {len(robots)} robots")
+    for name in victims:
+        if name not in robots:
+            raise CliError(f"--victims {name}: unknown robot; one of: {', '.join(robots)}")
+    out = [at_rate(rate, mode, parameters) for rate in rates]
+    out += [exactly(count, mode, parameters) for count in crashed]
+    if victims:
+        out.append(named(list(dict.fromkeys(victims)), mode, parameters))
+    return out or [crash_free()]

@@ -1,0 +1,1 @@
+"""`crash-coach report`: many runs as one page."""

@@ -1,0 +1,195 @@
+"""The report's tables in Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from crash_coach_bringup.cli.markdown import table
+from policy_pkg.report.paired import LEAST_PAIRS, PairedDifference
+from policy_pkg.report.rows import ALL_MAPS, Row, best
+from policy_pkg.statistics import Estimate
+
+NONE = "–"
+
+
+def page(
+    about: Mapping[str, Any],
+    rows: Sequence[Row],
+    paired: Sequence[PairedDifference],
+    runs: Sequence[Mapping[str, Any]],
+    differences: Sequence[str],
+) -> str:
+    """``about``: episodes, seed, mode, against, runs without_checkpoint; ``runs``: as
+    ``report.describe`` gives them; ``differences``: in training between the maps."""
+    mode = about["mode"]
+    if about["parameters"]:
+        values = ", ".join(f"{name} = {value:g}" for name, value in about["parameters"].items())
+        mode += f" ({values})"
+    parts = [
+        f"Success in % of {about['episodes']} greedy episodes per run and condition (evaluation "
+        f"seed {about['seed']}, the same episodes for every run; crashed robots: {mode}). "
+        + _checkpoints(runs),
+    ]
+    if len({row.method for row in rows}) > 1:
+        parts += ["## Methods", "Mean ± sample standard deviation over seeds; best in bold."]
+        parts += _overview(rows)
+    if about["against"]:
+        parts += ["## Differences", *_differences(paired)]
+    parts += ["## Intervals", _meaning(rows), _details(rows)]
+    parts += ["## Runs", "Success in %, and after the comma the mean return.", _runs(runs)]
+    waiting = [f"{path} has no checkpoint yet: left out." for path in about["without_checkpoint"]]
+    parts += [f"- {note}" for note in (*waiting, *notes(rows, runs), *differences)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _checkpoints(runs: Sequence[Mapping[str, Any]]) -> str:
+    """Which of a run's checkpoints the figures are of."""
+    if all(run["checkpoint"] == "last" for run in runs):
+        return "Of every run its last checkpoint acts."
+    return (
+        "Of runs called METHOD@best the checkpoint acts that was best in the run's own evaluation "
+        "blocks, of others the last one; the episodes here are none of those that chose it."
+    )
+
+
+def figure(rate: float) -> str:
+    """In %; equal rates look equal, whatever order they were added up in."""
+    return f"{round(100 * rate, 9):.1f}"
+
+
+def percent(row: Row) -> str:
+    """'87.5 ± 3.1', without deviation for a single seed and over all maps."""
+    return figure(row.mean) if row.std is None else f"{figure(row.mean)} ± {figure(row.std)}"
+
+
+def span(estimate: Estimate | None) -> str:
+    return NONE if estimate is None else f"{figure(estimate.low)}..{figure(estimate.high)}"
+
+
+def _overview(rows: Sequence[Row]) -> list[str]:
+    """As the paper has it: a table per map, methods down, conditions across."""
+    bold = best(rows)
+    maps: dict[str, dict[str, dict[str, str]]] = {}  # map -> method -> condition -> cell
+    for row in rows:
+        text = percent(row)
+        if (row.scenario, row.condition, row.method) in bold:
+            text = f"**{text}**"
+        maps.setdefault(row.scenario, {}).setdefault(row.method, {})[row.condition] = text
+    out = []
+    for name, methods in maps.items():
+        conditions = list(dict.fromkeys(row.condition for row in rows if row.scenario == name))
+        lines = [[m, *(cells.get(c, NONE) for c in conditions)] for m, cells in methods.items()]
+        out += [f"### {name}", table(["method", *conditions], lines)]
+    return out
+
+
+def _differences(paired: Sequence[PairedDifference]) -> list[str]:
+    """A table per condition, pairs of methods down, maps across."""
+    if not paired:
+        return [f"None: no two methods have {LEAST_PAIRS} seeds in common on a map."]
+    maps = list(dict.fromkeys(each.scenario for each in paired))
+    out = [
+        "In percentage points, of runs with the same seed: mean and Student's t interval (95 %), "
+        "without a correction for how many there are."
+    ]
+    for condition in dict.fromkeys(each.condition for each in paired):
+        lines: dict[str, dict[str, str]] = {}
+        for each in paired:
+            if each.condition == condition:
+                middle, half = each.interval.value, each.interval.high - each.interval.value
+                text = f"{round(100 * middle, 9):+.1f} ± {figure(half)}".replace("-", "−")
+                lines.setdefault(f"{each.method} − {each.against}", {})[each.scenario] = text
+        cells = [[pair, *(of.get(name, NONE) for name in maps)] for pair, of in lines.items()]
+        out += [f"### {condition}", table(["difference", *maps], cells)]
+    return out
+
+
+def _meaning(rows: Sequence[Row]) -> str:
+    lines = []
+    if any(len(row.seeds) > 1 for row in rows):
+        lines.append(
+            "Intervals (95 %) of the mean are Student's t over training seeds; those of the "
+            "interquartile mean (IQM) are a stratified bootstrap over seeds, which with three to "
+            "five seeds is too narrow (see Evaluation in docs/algorithms.md). With one episode per "
+            "run the former is Wilson's over seeds."
+        )
+    if any(len(row.seeds) == 1 for row in rows):
+        lines.append(
+            "Rows of one seed have Wilson's interval over its episodes (re-weighted rows: its "
+            "combination over the strata): it says nothing about other training seeds."
+        )
+    return " ".join(lines)
+
+
+def _details(rows: Sequence[Row]) -> str:
+    lines = []
+    for row in rows:
+        iqm = NONE
+        if row.iqm is not None:
+            iqm = f"{figure(row.iqm.value)} ({span(row.iqm)})"
+        returns = f"{sum(row.returns) / len(row.returns):.2f}" if row.returns else NONE
+        place = (row.scenario, row.condition, row.method, len(row.seeds))
+        lines.append([*place, percent(row), span(row.interval), iqm, returns])
+    columns = ["map", "condition", "method", "seeds", "success", "95 %", "IQM (95 %)", "return"]
+    return table(columns, lines)
+
+
+def _runs(runs: Sequence[Mapping[str, Any]]) -> str:
+    names = list(dict.fromkeys(name for run in runs for name in run["outcomes"]))
+    lines = []
+    for run in runs:
+        alpha = NONE if run["new_alpha"] is None else f"{run['new_alpha']:.2f}"
+        updates = NONE if run["gradient_steps"] is None else f"{run['gradient_steps']:,}"
+        cells = [_outcome(run["outcomes"].get(name)) for name in names]
+        acts = f"{run['checkpoint']}, {run['checkpoint_steps']:,}"
+        head = (run["scenario"], run["method"], run["seed"], f"{run['steps']:,}", acts, updates)
+        lines.append([*head, _minutes(run["wall_s"]), alpha, *cells])
+    columns = ["map", "method", "seed", "steps", "checkpoint"]
+    columns += ["gradient steps", "wall time", "α at the end"]
+    return table([*columns, *names], lines)
+
+
+def _outcome(outcome: Mapping[str, Any] | None) -> str:
+    if outcome is None:
+        return NONE
+    rate = 100 * outcome["successes"] / outcome["episodes"]
+    return f"{rate:.1f}, {outcome['return_mean']:.2f}"
+
+
+def _minutes(wall_s: float | None) -> str:
+    return NONE if wall_s is None else f"{wall_s / 60:.0f} min"
+
+
+def notes(rows: Sequence[Row], runs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What a reader of the figures has to know."""
+    out = []
+    for run in runs:
+        if run["steps"] < run["total_steps"]:
+            steps = f"{run['steps']:,} of {run['total_steps']:,} steps"
+            out.append(f"{run['run']} is not finished: {steps}.")
+    lengths: dict[tuple[str, str], set[int]] = {}
+    for run in runs:
+        lengths.setdefault((run["scenario"], run["method"]), set()).add(run["steps"])
+    for (scenario, method), found in lengths.items():
+        if len(found) > 1:
+            steps = ", ".join(f"{each:,}" for each in sorted(found))
+            out.append(
+                f"The seeds of {method} on {scenario} were not trained alike: {steps} steps."
+            )
+    for row in rows:
+        if row.not_measured > 0.001 and row.scenario != ALL_MAPS:
+            out.append(
+                f"{row.scenario}, {row.condition}: numbers of crashed robots that were not "
+                f"measured (probability {100 * row.not_measured:.1f} %) count as failures."
+            )
+    if any(row.alike for row in rows):
+        out.append(
+            "Where all episodes of a run went alike and nothing in them is left to chance they are "
+            "one episode: a single seed then has no interval, several have Wilson's over seeds."
+        )
+    if any(row.std == 0 for row in rows):
+        out.append(
+            "Where all seeds score alike, their interval has no width: that is no certainty."
+        )
+    return list(dict.fromkeys(out))

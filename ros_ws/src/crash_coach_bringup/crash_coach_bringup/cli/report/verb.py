@@ -1,0 +1,215 @@
+"""`crash-coach report`: many runs evaluated alike; tables and figures over seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from crash_coach_bringup.cli.options import ModeOption, ParamOption, conditions, mode_parameters
+from crash_coach_bringup.cli.output import CliError, console, write_json
+from crash_coach_bringup.cli.report.page import page
+from crash_coach_bringup.cli.verbs.evaluate import MOST_EPISODES
+from policy_pkg.play.conditions import Condition, crash_free, named
+from policy_pkg.report.finished_runs import (
+    Run,
+    differences,
+    find_runs,
+    has_begun,
+    last_metrics,
+    methods_of,
+    read_runs,
+    wall_time_s,
+)
+from policy_pkg.report.kept_evaluations import Evaluations, Result, arena
+from policy_pkg.report.paired import paired_differences
+from policy_pkg.report.rows import Row, exactly_crashed, improvements, rows
+
+CRASHED = (0, 1, 2)
+RATES = (0.01, 0.05, 0.1)
+
+
+def asked(
+    robots: tuple[str, ...],
+    crashed: Sequence[int] | None,
+    rates: Sequence[float] | None,
+    each_robot: bool,
+    mode: str,
+    parameters: Mapping[str, float],
+) -> list[Condition]:
+    """The conditions, exact numbers first; without any option all that a result should state."""
+    if not crashed and not rates and not each_robot:
+        crashed, rates = [k for k in CRASHED if k <= len(robots)], RATES
+    counts, drawn = list(dict.fromkeys(crashed or [])), list(dict.fromkeys(rates or []))
+    if not counts and not drawn:
+        found = []
+    else:
+        found = conditions(robots, drawn, counts, [], mode, parameters)
+        found = [*found[len(drawn) :], *found[: len(drawn)]]
+    found = [crash_free() if exactly_crashed(c) == 0 else c for c in found]
+    if each_robot:
+        found += [named([robot], mode, parameters) for robot in robots]
+    return found
+
+
+FoldersArgument = Annotated[
+    list[Path] | None,
+    typer.Argument(metavar="DIR", help="Runs, folders of runs; DIR@best: their best checkpoints."),
+]
+CrashedOption = Annotated[
+    list[int] | None,
+    typer.Option(help="K ...: exactly K robots crash, drawn anew each episode. [default: 0 1 2]"),
+]
+RateOption = Annotated[
+    list[float] | None,
+    typer.Option(
+        help="R ...: each robot crashes with probability R; with --crashed also estimated from "
+        "its results. [default: 0.01 0.05 0.1, or none where another crash option is given]"
+    ),
+]
+EachRobotOption = Annotated[
+    bool, typer.Option("--each-robot", help="Also each robot alone, in every episode.")
+]
+TrajectoriesOption = Annotated[
+    int | None,
+    typer.Option(help="SEED: draw the first episode of every method's run with that seed."),
+]
+AgainstOption = Annotated[
+    list[str] | None,
+    typer.Option(help="METHOD ...: also the differences of all others to these, paired by seed."),
+]
+
+
+def report(
+    folders: FoldersArgument = None,
+    out: Annotated[
+        Path, typer.Option(help="Folder for the tables and figures; goes on where it was left.")
+    ] = Path("report"),
+    episodes: Annotated[
+        int, typer.Option(help="Episodes per run and condition.", min=1, max=MOST_EPISODES)
+    ] = 128,
+    crashed: CrashedOption = None,
+    crash_rate: RateOption = None,
+    each_robot: EachRobotOption = False,
+    mode: ModeOption = "mute",
+    param: ParamOption = None,
+    seed: Annotated[int, typer.Option(help="Of the episodes, the same for every run.", min=0)] = 0,
+    against: AgainstOption = None,
+    trajectories: TrajectoriesOption = None,
+) -> None:
+    """Compares methods over seeds: evaluates many runs alike.
+
+    Runs with equal settings are seeds of one method, which is called what their folders are.
+    """
+    if not folders:
+        raise CliError("nothing to report on: name runs or folders of runs")
+    parameters = mode_parameters(mode, param or [])
+    runs, waiting = _begun(find_runs(folders))
+    _check_methods(against or [], runs)
+    wanted = {
+        name: asked(arena(name)[0], crashed, crash_rate, each_robot, mode, parameters)
+        for name in dict.fromkeys(run.scenario for run in runs)
+    }
+    exact = any(exactly_crashed(c) is not None for found in wanted.values() for c in found)
+    rates = crash_rate or ([] if crashed or each_robot else RATES)
+    about = {
+        "episodes": episodes,
+        "seed": seed,
+        "mode": mode,
+        "parameters": parameters,
+        "against": against or [],
+        "without_checkpoint": [str(path) for path in waiting],
+    }
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        results = _play(runs, wanted, Evaluations(out / "evaluations", episodes, seed))
+        found = rows(results, list(dict.fromkeys(rates)) if exact else [])
+        _write(out, about, found, results, trajectories)
+    except OSError as error:
+        raise CliError(f"--out {out}: {error.strerror}: {error.filename}") from error
+
+
+def _begun(paths: Sequence[Path]) -> tuple[list[Run], list[Path]]:
+    """The runs, and those that have no checkpoint yet."""
+    waiting = [path for path in paths if not has_begun(path)]
+    runs = read_runs(path for path in paths if path not in waiting)
+    if not runs:
+        raise CliError(f"none of {len(waiting)} runs has a checkpoint yet, as {waiting[0]}")
+    return runs, waiting
+
+
+def _check_methods(against: Sequence[str], runs: Sequence[Run]) -> None:
+    methods = methods_of(runs)
+    for name in against:
+        if name not in methods:
+            raise CliError(f"--against {name}: no such method; there are {', '.join(methods)}")
+
+
+def _play(
+    runs: Sequence[Run], wanted: Mapping[str, Sequence[Condition]], evaluations: Evaluations
+) -> list[Result]:
+    results = []
+    for run in runs:
+
+        def say(condition: Condition, run: Run = run) -> None:
+            best = " (best)" if run.is_best else ""
+            text = f"{run.path}{best} on {run.scenario}: {condition.name}"
+            console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+        results.append(evaluations.result(run, wanted[run.scenario], say))
+    return results
+
+
+def describe(result: Result) -> dict[str, Any]:
+    """A run in figures, JSON values; null where its directory does not tell."""
+    run, metrics = result.run, last_metrics(result.run.path)
+    return {
+        "run": str(run.path),
+        "scenario": run.scenario,
+        "method": run.method,
+        "seed": run.seed,
+        "steps": run.steps,
+        "checkpoint": "best" if run.is_best else "last",
+        "checkpoint_steps": run.checkpoint_steps,
+        "total_steps": run.total_steps,
+        "settings": run.settings,
+        "gradient_steps": metrics.get("gradient_steps"),
+        "new_alpha": metrics.get("new_alpha"),
+        "wall_s": wall_time_s(run.path),
+        "outcomes": {condition.name: asdict(outcome) for condition, outcome in result.outcomes},
+    }
+
+
+def _write(
+    out: Path,
+    about: Mapping[str, Any],
+    found: Sequence[Row],
+    results: Sequence[Result],
+    run_seed: int | None,
+) -> None:
+    """Tables, JSON and figures; ``run_seed``: whose trajectories are drawn, if any."""
+    better = improvements(found)
+    described = [describe(result) for result in results]
+    paired = paired_differences(found, about["against"])
+    text = page(about, found, paired, described, differences([each.run for each in results]))
+    (out / "table.md").write_text(text, encoding="utf-8")
+    content = {
+        **about,
+        "rows": [asdict(row) for row in found],
+        "paired_differences": [asdict(each) for each in paired],
+        "improvements": [asdict(each) for each in better],
+        "runs": described,
+    }
+    write_json(out / "results.json", content)
+    # Imported here: no other verb should wait for matplotlib.
+    from crash_coach_bringup.cli.report import figures as report_figures
+
+    drawn = report_figures.write(found, better, [each.run for each in results], out)
+    if run_seed is not None:
+        drawn.append(report_figures.trajectories(results, run_seed, about["seed"], out))
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
+    for path in (out / "table.md", out / "results.json", *drawn):
+        console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,1 @@
+"""The verbs of `crash-coach`, a file each."""

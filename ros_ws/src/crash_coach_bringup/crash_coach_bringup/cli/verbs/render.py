@@ -1,0 +1,190 @@
+"""`crash-coach render`: an episode, played or recorded, as a film or a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from crash_coach_bringup.cli.options import ModeOption, ParamOption, conditions, mode_parameters
+from crash_coach_bringup.cli.output import (
+    CliError,
+    check_file_target,
+    check_json_target,
+    console,
+    write_json,
+)
+from crash_coach_bringup.cli.target import HELP, load_target
+from crash_coach_common.strict_yaml import ConfigError
+from policy_pkg.bags.bag import holds_bags
+from policy_pkg.bags.playback import play_back, read_episode
+from policy_pkg.play.conditions import Condition
+from policy_pkg.play.evaluate import record
+from sim_pkg.render.frames import Frames
+
+FILMS, STILLS = (".mp4", ".gif"), (".png",)
+OF_A_TEAM = ("seed", "crash_rate", "crashed", "victims", "mode", "param")
+
+
+def check_out(out: Path) -> None:
+    """As ``check_file_target``.
+
+    Raises:
+        CliError: also for another suffix.
+    """
+    if out.suffix not in FILMS + STILLS:
+        raise CliError(f"--out {out}: a file ending in {', '.join(FILMS + STILLS)} is needed")
+    check_file_target("--out", out)
+
+
+def draw(frames: Frames, out: Path, speed: float) -> None:
+    """Writes the episode to ``out``.
+
+    Raises:
+        CliError: the file cannot be written.
+    """
+    # Imported here: no other verb should wait for matplotlib.
+    from sim_pkg.render.film import write_video
+    from sim_pkg.render.still import draw_still
+
+    try:
+        if out.suffix in STILLS:
+            draw_still(frames, out)
+        else:
+            write_video(frames, out, speed)
+    except OSError as error:
+        raise CliError(f"--out: {out} cannot be written: {error.strerror}") from None
+
+
+def outcome(frames: Frames) -> dict[str, Any]:
+    """JSON values: which episode it is, and how it ended."""
+    return {
+        "scenario": frames.scenario,
+        "seed": frames.seed,
+        "episode": frames.episode,
+        "crashed": list(frames.faulted),
+        "success": frames.success,
+        "steps": frames.steps,
+        "episode_return": float(frames.returns[-1]),
+        "trajectory_hash": frames.trajectory_hash,
+    }
+
+
+def show(frames: Frames, out: Path) -> None:
+    who = ", ".join(frames.actors[i].name for i in frames.faulted) or "nobody"
+    done = "success" if frames.success else "no success"
+    told = f"episode {frames.episode}: {done} after {frames.steps} steps; crashed: {who}"
+    console.print(told, highlight=False)
+    console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
+
+
+def is_recording(name: str) -> bool:
+    """Whether it is meant as one: bags.bag tells what is wrong with those that cannot be read."""
+    path = Path(name)
+    if path.is_file():
+        return path.suffix in (".mcap", ".db3")
+    return path.is_dir() and ((path / "metadata.yaml").exists() or holds_bags(path))
+
+
+def recorded(name: str, episode: int | None, scenario: str | None) -> tuple[Frames, dict[str, Any]]:
+    """A recorded episode played again, and JSON values of what was recorded.
+
+    Raises:
+        BagError: no such recording or episode.
+        CliError: the scenario is not told, or not known here.
+        UserError: it gives another trajectory here.
+    """
+    found, about = read_episode(Path(name), episode)
+    told = about.scenario if about is not None else ""
+    chosen = scenario or told
+    if not chosen:
+        raise CliError(f"{name}: the recording does not name its scenario: --scenario is needed")
+    try:
+        frames = play_back(found, chosen)
+    except ConfigError as error:
+        if scenario is not None:
+            raise
+        raise CliError(
+            f"{name}: recorded with a scenario that is not here ({error}); --scenario FILE names it"
+        ) from None
+    return frames, {"recording": name, "modes": sorted(set(found.modes.values()))}
+
+
+def render(
+    context: typer.Context,
+    team: Annotated[str, typer.Argument(metavar="TEAM", help=f"{HELP[:-1]}; or a recording.")],
+    out: Annotated[Path, typer.Option(help="A .mp4 or .gif film, or a .png picture.")],
+    scenario: Annotated[
+        str | None,
+        typer.Option(help="Scenario name or YAML file; default: the trained team's, the recorded."),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed, as of evaluate.", min=0)] = 0,
+    episode: Annotated[
+        int | None,
+        typer.Option(
+            help="Its number; default: 0, of a recording the first that is complete.",
+            min=0,
+            max=2**32 - 1,
+        ),
+    ] = None,
+    crash_rate: Annotated[
+        float | None, typer.Option(help="Each robot crashes with this probability.")
+    ] = None,
+    crashed: Annotated[int | None, typer.Option(help="So many robots crash, drawn.")] = None,
+    victims: Annotated[list[str] | None, typer.Option(help="ROBOT ...: these robots.")] = None,
+    mode: ModeOption = "stay",
+    param: ParamOption = None,
+    speed: Annotated[float, typer.Option(help="Of a film, times real time.")] = 1.0,
+    json: Annotated[Path | None, typer.Option(help="Also write what happened here.")] = None,
+) -> None:
+    """Draws an episode: of a team the one that evaluate plays, of a recording the one recorded.
+
+    Needs no display. A recorded episode is played again from its seed and the actions that were
+    executed, and drawn only where that gives the recorded trajectory, bit for bit.
+    """
+    check_json_target(json)
+    check_out(out)
+    if not 0.01 <= speed <= 1000:
+        raise CliError(f"--speed {speed}: 0.01 to 1000 times real time")
+    if is_recording(team):
+        refuse_options_of_a_team(context)
+        frames, which = recorded(team, episode, scenario)
+    else:
+        parameters = mode_parameters(mode, param or [])
+        target = load_target(team, scenario)
+        condition = one_condition(target.robots, crash_rate, crashed, victims, mode, parameters)
+        first = episode or 0
+        (frames,) = record(target.team, target.scenario, condition, range(first, first + 1), seed)
+        crash = condition.crash.model_dump(mode="json")
+        which = {"team": team, "condition": condition.name, "crash": crash}
+    draw(frames, out, speed)
+    show(frames, out)
+    write_json(json, {**which, **outcome(frames), "file": str(out)})
+
+
+def refuse_options_of_a_team(context: typer.Context) -> None:
+    """Raises CliError for what a recording has settled."""
+    for name in OF_A_TEAM:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name != "DEFAULT":
+            option = name.replace("_", "-")
+            raise CliError(f"--{option} has no meaning with a recording: it says who crashed how")
+
+
+def one_condition(
+    robots: tuple[str, ...],
+    crash_rate: float | None,
+    crashed: int | None,
+    victims: list[str] | None,
+    mode: str,
+    parameters: Mapping[str, float],
+) -> Condition:
+    """Raises CliError where more than one is asked for."""
+    rates = [] if crash_rate is None else [crash_rate]
+    counts = [] if crashed is None else [crashed]
+    asked = conditions(robots, rates, counts, victims or [], mode, parameters)
+    if len(asked) > 1:
+        raise CliError("--crash-rate, --crashed, --victims: an episode is played under one of them")
+    return asked[0]

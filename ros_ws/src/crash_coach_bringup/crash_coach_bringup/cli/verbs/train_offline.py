@@ -1,0 +1,114 @@
+"""`crash-coach train-offline`: one run on recorded episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+
+from crash_coach_bringup.cli.output import CliError, console
+from policy_pkg.bags.dataset import load_episodes
+from policy_pkg.bags.problems import Problem
+from policy_pkg.train.offline.config import OfflineConfig, load_offline_config
+
+if TYPE_CHECKING:
+    from policy_pkg.train.offline.run import OfflineReport
+
+
+def _tell(problem: Problem) -> None:
+    console.print(f"[yellow]{problem}[/yellow]", soft_wrap=True)
+
+
+class _Bar:
+    """Shows OfflineReports in a progress bar."""
+
+    def __init__(self, bars: Progress, task: TaskID) -> None:
+        self._bars, self._task = bars, task
+
+    def show(self, report: OfflineReport) -> None:
+        if report.warning:
+            console.print(f"[yellow]{report.warning}[/yellow]", soft_wrap=True)
+        figures = f"{report.steps_per_s:,.0f} gradient steps/s"
+        if report.success_crash_free is not None:
+            figures = f"success {report.success_crash_free:.2f}  {figures}"
+        done = report.gradient_steps / report.total_steps
+        self._bars.update(self._task, completed=done, figures=figures)
+
+
+def plan_runs(
+    config: str, out: Path, overrides: list[str], seeds: list[int]
+) -> dict[Path, OfflineConfig]:
+    """Run directory -> its settings; ``out`` itself for one seed, folders below it for more."""
+    if len(seeds) < 2:
+        settings = load_offline_config(config, overrides, seeds[0] if seeds else None)
+        return {out: settings}
+    if len(set(seeds)) < len(seeds):
+        raise CliError(f"--seed {' '.join(map(str, seeds))}: a seed comes twice")
+    return {
+        out / f"{Path(config).stem}-s{seed}": load_offline_config(config, overrides, seed)
+        for seed in seeds
+    }
+
+
+def train_offline(
+    config: Annotated[
+        str,
+        typer.Argument(help="A name such as offline/conservative_qmix, or a YAML file."),
+    ],
+    bags: Annotated[
+        list[Path],
+        typer.Argument(metavar="BAG...", help="Recordings, or folders of recordings."),
+    ],
+    out: Annotated[Path, typer.Option(help="Run directory; with several seeds, their parent.")],
+    override: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="key=value ...: replaces settings, e.g. learner.lr=1e-3"),
+    ] = None,
+    seed: Annotated[
+        list[int] | None,
+        typer.Option(help="Seed; several give several runs, one after another."),
+    ] = None,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Go on from the newest checkpoint; what is finished stays."),
+    ] = False,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Refuse recordings with any problem.")
+    ] = False,
+) -> None:
+    """Trains a team on recorded episodes, without a simulator. Recordings are read once."""
+    train_runs(plan_runs(config, out, override or [], seed or []), bags, resume, strict)
+
+
+def train_runs(
+    runs: Mapping[Path, OfflineConfig], bags: Sequence[Path], resume: bool, strict: bool
+) -> None:
+    """One run after another, whose configs differ in nothing but the seed.
+
+    Raises:
+        UserError: as ``policy_pkg.train.offline.run``.
+    """
+    # Imported here: the other verbs do without torch.
+    from policy_pkg.train.offline import run as offline
+
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=24))
+    with Progress(*columns, TextColumn("{task.fields[figures]}"), console=console) as bars:
+        tasks = {run: bars.add_task(run.name, total=1.0, figures="waiting") for run in runs}
+        data = offline.read_data(next(iter(runs.values())), load_episodes(bags, strict, _tell))
+        for run, settings in runs.items():
+            summary = offline.train_offline(
+                settings,
+                data,
+                run,
+                resume=resume,
+                progress=_Bar(bars, tasks[run]).show,
+                sources=[str(path) for path in bags],
+            )
+            steps, episodes = summary.gradient_steps, summary.episodes
+            console.print(
+                f"{steps:,} gradient steps on {episodes:,} episodes in {summary.wall_s:.0f} s"
+            )
+            console.print(f"  checkpoint: {run}", soft_wrap=True)

@@ -1,0 +1,76 @@
+"""`crash-coach up`: a trained team as a running, supervised ROS graph."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from crash_coach_bringup.cli.output import CliError
+from crash_coach_bringup.cli.verbs.evaluate import Layout, LayoutOption
+from policy_pkg.play.conditions import at_rate, crash_free
+
+if TYPE_CHECKING:
+    from crash_coach_bringup.ros.supervisor import Event
+
+
+class Mode(StrEnum):
+    lockstep = "lockstep"
+    realtime = "realtime"
+
+
+def show(event: Event) -> None:
+    """One line per event; a death goes to stderr with the end of the node's log."""
+    words = [word for word in (event.kind, event.process, event.text) if word]
+    typer.echo(f"up: {': '.join(words)}", err=event.kind == "died")
+
+
+def up(
+    scenario: Annotated[str, typer.Argument(help="Scenario name or YAML file.")],
+    policy: Annotated[Path, typer.Option(help="Run directory, RUN@best, or checkpoint directory.")],
+    mode: Annotated[
+        Mode, typer.Option(help="As fast as every robot answers, or by the clock.")
+    ] = Mode.lockstep,
+    layout: LayoutOption = Layout.nodes,
+    episodes: Annotated[int, typer.Option(help="End after this many; 0: run on.", min=0)] = 0,
+    seed: Annotated[
+        int, typer.Option(help="Seed of episodes, crashes and random actions.", min=0)
+    ] = 0,
+    epsilon: Annotated[
+        float,
+        typer.Option(help="Probability of a random action, per robot and step; 1: a random team."),
+    ] = 0.0,
+    crash_rate: Annotated[
+        float, typer.Option(help="Each robot is mute in an episode with this probability.")
+    ] = 0.0,
+    relay_observations: Annotated[
+        bool,
+        typer.Option(
+            "--relay-observations",
+            help="Observations pass through the gate: blind, stale and noise can be injected.",
+        ),
+    ] = False,
+    logs: Annotated[Path, typer.Option(help="Folder for the nodes' logs.")] = Path("runs/up"),
+) -> None:
+    """Starts sim, policies, gate and coach until the last episode, Ctrl-C, or a node's death."""
+    for name, value in (("epsilon", epsilon), ("crash-rate", crash_rate)):
+        if not 0 <= value <= 1:
+            raise CliError(f"--{name} {value}: a probability from 0 to 1 is needed")
+    from crash_coach_bringup.ros.graph import UpOptions
+    from crash_coach_bringup.ros.up import run_up
+
+    options = UpOptions(
+        scenario=scenario,
+        checkpoint=policy,
+        mode="lockstep" if mode is Mode.lockstep else "realtime",
+        layout=layout.value,
+        episodes=episodes,
+        seed=seed,
+        epsilon=epsilon,
+        coach=(at_rate(crash_rate) if crash_rate > 0 else crash_free()).crash,
+        relay_observations=relay_observations,
+        log_dir=logs,
+    )
+    raise typer.Exit(run_up(options, show))

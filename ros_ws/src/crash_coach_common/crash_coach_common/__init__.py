@@ -1,0 +1,1 @@
+"""The common floor: what simulator, coach and policies all stand on."""

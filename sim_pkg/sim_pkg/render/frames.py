@@ -1,0 +1,202 @@
+"""An episode as what can be drawn of it, step by step; the render modules draw it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from crash_coach_common.contract import BoolArray, FloatArray
+from sim_pkg.env import Env
+from sim_pkg.scenarios.base import Scene
+from sim_pkg.scenarios.skirmish.config import SkirmishConfig
+from sim_pkg.scenarios.skirmish.layout import (
+    STATE_HEALTH,
+    STATE_OPPONENT_HEALTH,
+    STATE_OPPONENT_SHIELD,
+    STATE_SHIELD,
+)
+
+
+class Side(IntEnum):
+    """Whose a body is."""
+
+    ROBOTS = 0
+    OPPONENTS = 1
+    THINGS = 2
+
+
+@dataclass(frozen=True)
+class Actor:
+    """One body of an episode; a disc, or where it has a size, a box of (width, height)."""
+
+    name: str
+    kind: str
+    side: Side
+    radius_m: float
+    size_m: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Frames:
+    """One episode of T steps: what was where before the first step and after each one.
+
+    The first n of the d actors are the robots, in their order.
+    """
+
+    scenario: str
+    seed: int
+    episode: int
+    dt_s: float
+    scene: Scene
+    walled_m: tuple[float, float, float, float]  # x1, y1, x2, y2 of the part between the walls
+    actors: tuple[Actor, ...]
+    positions_m: FloatArray  # (T+1, d, 2)
+    angles_rad: FloatArray  # (T+1, d)
+    health: FloatArray  # (T+1, d) share of the full health, 0: dead; 1 without such a thing
+    shield: FloatArray  # (T+1, d) share of the full shield
+    damage: FloatArray  # (T, d, d) what i took from j in a step
+    sites_done: BoolArray  # (T+1, m)
+    crashed: BoolArray  # (T, n) robots whose command a fault replaced
+    returns: npt.NDArray[np.float64]  # (T+1,) sum of the rewards so far
+    success: bool
+    trajectory_hash: str
+
+    @property
+    def steps(self) -> int:
+        return len(self.crashed)
+
+    @property
+    def n_robots(self) -> int:
+        return int(self.crashed.shape[1])
+
+    @property
+    def alive(self) -> BoolArray:
+        """(T+1, d)"""
+        alive: BoolArray = self.health > 0
+        return alive
+
+    @property
+    def hits(self) -> BoolArray:
+        """(T, d) which actors were hit in a step."""
+        hits: BoolArray = np.any(self.damage > 0, axis=1)
+        return hits
+
+    @property
+    def faulted(self) -> tuple[int, ...]:
+        """Robots that were crashed in any step."""
+        return tuple(np.flatnonzero(self.crashed.any(axis=0)).tolist())
+
+    def indexes(self, side: Side) -> list[int]:
+        return [i for i, actor in enumerate(self.actors) if actor.side is side]
+
+
+class Recorder:
+    """Gathers the Frames of one arena's running episode; to be made right after its reset."""
+
+    def __init__(self, env: Env, arena: int, seed: int, episode: int) -> None:
+        self._env = env
+        self._arena = arena
+        self._key = (seed, episode)
+        self._bodies: list[tuple[FloatArray, FloatArray]] = []
+        self._vitals: list[tuple[FloatArray, FloatArray]] = []
+        self._sites_done: list[BoolArray] = []
+        self._damage: list[FloatArray] = []
+        self._crashed: list[BoolArray] = []
+        self._returns = [0.0]
+        self._look()
+
+    def step(self, crashed: BoolArray, reward: float) -> None:
+        """After a control step. crashed: (n,) whose command a fault replaced in it."""
+        self._crashed.append(crashed.copy())
+        self._damage.append(self._env.hits[self._arena].copy())
+        self._returns.append(self._returns[-1] + reward)
+        self._look()
+
+    def finish(self, success: bool, trajectory_hash: str) -> Frames:
+        """What was gathered, when the episode has ended."""
+        env, (seed, episode) = self._env, self._key
+        return Frames(
+            scenario=env.spec.scenario,
+            seed=seed,
+            episode=episode,
+            dt_s=env.spec.dt_s,
+            scene=env.scene,
+            walled_m=walled_m(env),
+            actors=actors(env),
+            positions_m=np.stack([positions for positions, _ in self._bodies]),
+            angles_rad=np.stack([angles for _, angles in self._bodies]),
+            health=np.stack([health for health, _ in self._vitals]),
+            shield=np.stack([shield for _, shield in self._vitals]),
+            damage=self._all_damage(),
+            sites_done=np.stack(self._sites_done),
+            crashed=np.stack(self._crashed),
+            returns=np.array(self._returns),
+            success=success,
+            trajectory_hash=trajectory_hash,
+        )
+
+    def _all_damage(self) -> FloatArray:
+        """(T, d, d); only discs take and do damage, and they come first."""
+        among_discs = np.stack(self._damage)
+        more = self._env.world.bodies.shape[1] - among_discs.shape[1]
+        return np.pad(among_discs, ((0, 0), (0, more), (0, more)))
+
+    def _look(self) -> None:
+        env, arena = self._env, self._arena
+        bodies, turns = env.world.bodies[arena], env.world.turns[arena]
+        self._bodies.append((bodies[:, :2].astype(np.float32), turns[:, 0].astype(np.float32)))
+        self._vitals.append(vitals(env, arena))
+        self._sites_done.append(env.sites_done[arena].copy())
+
+
+def walled_m(env: Env) -> tuple[float, float, float, float]:
+    """x1, y1, x2, y2 of the part of the arena between its walls."""
+    if isinstance(env.config, SkirmishConfig):
+        return env.config.free_m
+    width, height = env.scene.arena_m
+    return (0.0, 0.0, width, height)
+
+
+def actors(env: Env) -> tuple[Actor, ...]:
+    """Who and what takes part in the scenario, in the order of the world's bodies."""
+    names, config = env.spec.robots, env.config
+    if isinstance(config, SkirmishConfig):
+        n = len(names)
+        labels = (*names, *(f"opponent_{j + 1}" for j in range(len(config.opponents))))
+        return tuple(
+            Actor(name, placed.unit, Side(int(i >= n)), unit.radius_m)
+            for i, (name, placed, unit) in enumerate(
+                zip(labels, config.placed, config.units, strict=True)
+            )
+        )
+    robots = tuple(
+        Actor(name, "robot", Side.ROBOTS, radius)
+        for name, radius in zip(names, env.scene.radii_m, strict=True)
+    )
+    boxes = tuple(
+        Actor(f"box_{k + 1}", "box", Side.THINGS, 0.0, size_m)
+        for k, size_m in enumerate(env.scene.boxes_m)
+    )
+    return robots + boxes
+
+
+def vitals(env: Env, arena: int) -> tuple[FloatArray, FloatArray]:
+    """(d,) health and (d,) shield of the scenario's actors, as shares of the full ones."""
+    config = env.config
+    if not isinstance(config, SkirmishConfig):
+        d = env.world.bodies.shape[1]
+        return np.ones(d, dtype=np.float32), np.zeros(d, dtype=np.float32)
+    layout = config.layout
+    parts = layout.split_state(env.state[arena])
+    robots, opponents = parts.robots, parts.opponents
+    health = (robots[:, STATE_HEALTH], opponents[:, STATE_OPPONENT_HEALTH])
+    shield = (
+        robots[:, STATE_SHIELD] if layout.robot_shields else np.zeros(layout.n_robots),
+        opponents[:, STATE_OPPONENT_SHIELD]
+        if layout.opponent_shields
+        else np.zeros(layout.n_opponents),
+    )
+    return np.concatenate(health), np.concatenate(shield).astype(np.float32)

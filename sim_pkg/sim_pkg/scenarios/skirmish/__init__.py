@@ -1,0 +1,1 @@
+"""Combat of two teams with SMAC's observations, actions and reward."""
