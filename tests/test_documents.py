@@ -57,7 +57,7 @@ def typed(folder: Path, commands: list[str], env: dict[str, str]) -> str:
     """Types the commands and waits; returns what was printed. They must all succeed."""
     shell = session(folder, commands, env)
     try:
-        output, _ = shell.communicate(timeout=100)
+        output, _ = shell.communicate(timeout=200)
     finally:
         if shell.poll() is None:
             os.killpg(shell.pid, signal.SIGKILL)
@@ -128,15 +128,57 @@ def test_the_test_command_is_the_gate(folder: Path, env: dict[str, str]) -> None
     assert "pytest" in typed(folder, ["make --dry-run test"], env)
 
 
-def test_up_inject_and_param_set(folder: Path, env: dict[str, str]) -> None:
+def launch() -> list[str]:
+    """What starts a graph with a distribution's command line."""
+    commands = block(f"source {DISTRIBUTION}")
+    return commands if DISTRIBUTION.exists() else commands[1:]
+
+
+def up_and_inject() -> tuple[list[str], list[str]]:
     up, inject = [lines for lines in blocks() if lines[0] == ". ./env.sh"]
     assert "crash-coach up" in up[1]
+    return up, inject
+
+
+def crash_and_clear(folder: Path, commands: list[str], env: dict[str, str]) -> None:
+    """Types commands that crash robot_1 and end that: on the graph it has to be seen."""
+    from crash_coach_interfaces.msg import FaultEvent
+
+    events: list[FaultEvent] = []
+    with graph_client("documents", int(env["ROS_DOMAIN_ID"])) as client:
+        client.node.create_subscription(FaultEvent, "/coach/events", events.append, 1000)
+        client.until(
+            lambda: client.node.count_publishers("/coach/events") > 0, 60, "the gate's events"
+        )
+        output = typed(folder, commands, env)
+        assert "fail" not in output.lower()
+        client.until(
+            lambda: any(e.kind == FaultEvent.CLEARED and not e.robot for e in events),
+            20,
+            "the end of the fault",
+        )
+    assert {(e.robot, e.mode) for e in events if e.kind == FaultEvent.ACTIVE} == {
+        ("robot_1", "mute")
+    }
+    wait_for_steps(env)
+
+
+# Each block on a fresh graph: what one sets must not be what lets another work.
+
+
+def test_up_and_inject(folder: Path, env: dict[str, str]) -> None:
+    up, inject = up_and_inject()
     with running(folder, up, env):
         wait_for_steps(env)
-        typed(folder, inject, env)
-        output = typed(folder, [". ./env.sh", *block("ros2 param set /coach enabled true")], env)
-        assert "fail" not in output.lower()
+        crash_and_clear(folder, inject, env)
+
+
+@pytest.mark.parametrize("start", ["up", "launch"])
+def test_param_set(folder: Path, env: dict[str, str], start: str) -> None:
+    with running(folder, up_and_inject()[0] if start == "up" else launch(), env):
         wait_for_steps(env)
+        commands = block("ros2 param set /coach enabled true")
+        crash_and_clear(folder, [". ./env.sh", *commands], env)
 
 
 def test_train_and_evaluate(folder: Path, env: dict[str, str]) -> None:
@@ -145,19 +187,32 @@ def test_train_and_evaluate(folder: Path, env: dict[str, str]) -> None:
     assert (folder / "runs" / "mine.json").exists()
 
 
-def test_launch_with_a_distribution(folder: Path, env: dict[str, str]) -> None:
-    commands = block(f"source {DISTRIBUTION}")
-    if not DISTRIBUTION.exists():
-        commands = commands[1:]
-    with running(folder, commands, env):
-        wait_for_steps(env)
+def node_by_node() -> list[str]:
+    """The README's commands: gate, coach, team, sim."""
+    commands = [line for lines in blocks() for line in lines if line.startswith("ros2 run")]
+    assert len(commands) == 4
+    return commands
+
+
+def together(commands: list[str]) -> list[str]:
+    return [". ./env.sh", *(f"{line} &" for line in commands), "wait"]
 
 
 def test_node_by_node(folder: Path, env: dict[str, str]) -> None:
-    commands = [line for lines in blocks() for line in lines if line.startswith("ros2 run")]
-    assert len(commands) == 4
-    with running(folder, [". ./env.sh", *(f"{line} &" for line in commands), "wait"], env):
+    with running(folder, together(node_by_node()), env):
         wait_for_steps(env)
+
+
+def test_live_training_by_hand(folder: Path, env: dict[str, str]) -> None:
+    """docs/live.md, for the graph of the README without its trained team."""
+    page = (ROOT / "docs" / "live.md").read_text()
+    (live,) = re.findall(r"```bash\n(.*?)```", page, flags=re.DOTALL)
+    commands = live.replace("/path/of/a/run", "runs/live_by_hand").strip().splitlines()
+    assert len(commands) == 2
+    gate, coach, _, sim = node_by_node()
+    with running(folder, together([gate, coach, sim, *commands]), env):
+        wait_for_steps(env)
+    assert (folder / "runs" / "live_by_hand").is_dir()
 
 
 def test_no_block_is_left_out() -> None:

@@ -9,7 +9,6 @@ from crash_coach_pkg.coach.parameters import NO_RETURN, Value
 from crash_coach_pkg.faults import check_parameters, fault_mode
 
 NOBODY_ELSE: Mapping[str, Value] = {
-    "strategy": "fixed",
     "crashed_exactly": -1,
     "victim_role": "",
     "hazard_rate_hz": 0.0,

@@ -15,7 +15,7 @@ from crash_coach_bringup.cli.output import CliError
 from crash_coach_pkg.coach.config import FaultConfig, TeamSpec
 from crash_coach_pkg.coach.expectations import Expectation
 from crash_coach_pkg.coach.fault_scenario import load_fault_scenario
-from crash_coach_pkg.coach.parameters import build_settings, parameter_specs
+from crash_coach_pkg.coach.parameters import build_settings, check_change, parameter_specs
 from crash_coach_pkg.faults import fault_mode, mode_names
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "faults.md"
@@ -81,7 +81,7 @@ def test_each_command_line_sets_a_parameter_within_its_range(
     if spec.low is not None and spec.high is not None:
         assert spec.low <= value <= spec.high
     values = {s.name: s.default for s in parameter_specs()}
-    build_settings({**values, name: value}, TEAM)
+    check_change(build_settings({**values, name: value}, TEAM), [name])
 
 
 def test_the_example_is_a_fault_scenario_that_fits(tmp_path: Path) -> None:

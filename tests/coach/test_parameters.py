@@ -98,7 +98,8 @@ def test_a_wrong_configuration_is_refused_with_the_reason(
     ("values", "message"),
     [
         ({"victims": ("robot_1",), "enabled": False}, "victims would have no effect: enabled"),
-        ({"victims": ("robot_1",), "strategy": "none"}, "strategy is none"),
+        ({"victims": ("robot_1",), "strategy": "none"}, None),
+        ({"crashed_exactly": 1, "strategy": "none"}, "crashed_exactly .* strategy is none"),
         ({"crashed_exactly": 1, "enabled": False}, "crashed_exactly would have no effect"),
         ({"victims": ("none",), "enabled": False}, None),
         ({"victims": ("robot_1",), "enabled": True}, None),

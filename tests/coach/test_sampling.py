@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from crash_coach_pkg.coach.coach import Coach
 from crash_coach_pkg.coach.config import CapRule, CoachConfig, TeamSpec
 from crash_coach_pkg.coach.draws import most_crashed
+from crash_coach_pkg.coach.strategies import strategy_names
 from crash_coach_pkg.coach.victims import crash_cap, draw_exactly, draw_mask, episode_rng
 from crash_coach_pkg.plan import AT_START_STEP
 
@@ -149,6 +150,13 @@ def test_victims_mode_window_and_cap_reach_the_plan() -> None:
         (2, "random", 4, 2),
     ]
     assert {(f.parameters, f.trigger, f.entry) for f in plan.faults} == {((), AT_START_STEP, 0)}
+
+
+@pytest.mark.parametrize("strategy", strategy_names())
+def test_named_victims_crash_under_every_strategy(strategy: str) -> None:
+    config = CoachConfig(strategy=strategy, victims=("robot_3",))
+    plan = Coach(config, TEAM, seed=6).plan(17)
+    assert ([f.robot for f in plan.faults], plan.cap) == ([2], 1)
 
 
 def test_crashed_exactly_varies_the_victims_and_keeps_the_number() -> None:

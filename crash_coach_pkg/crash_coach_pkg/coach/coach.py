@@ -121,7 +121,7 @@ class Coach:
     def _mask(self, episode: int) -> tuple[BoolArray, int]:
         """(n,) victims, and how many may be faulted together."""
         config, n = self._config, self._team.n
-        if config.strategy == "none":
+        if config.strategy == "none" and not config.victims:
             return np.zeros(n, dtype=np.bool_), 0
         rng = episode_rng(self._seed, episode)
         by_rate = not self._everybody and not config.victims and config.crashed_exactly < 0

@@ -195,8 +195,9 @@ class FaultConfig(BaseModel):
 class CoachConfig(FaultConfig):
     """Who crashes, how often and how.
 
-    Precedence of the victims: strategy ``none`` crashes nobody; ``victims`` crash in every
-    episode; ``crashed_exactly`` draws that many in every episode; otherwise the crash rate draws.
+    Precedence of the victims: ``victims`` crash in every episode, under every strategy; strategy
+    ``none`` draws nobody; ``crashed_exactly`` draws that many in every episode; otherwise the crash
+    rate draws.
     With a hazard or condition and a fixed rate of 0, every candidate is a victim.
     """
 

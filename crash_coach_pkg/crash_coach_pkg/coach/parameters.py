@@ -52,8 +52,8 @@ SPECIAL = {
     "victims": ParameterSpec(
         "victims",
         (NOBODY,),
-        "Robots that crash in every episode; ['none']: victims are drawn by crash_rate (an empty "
-        "list has no type in ROS and is refused).",
+        "Robots that crash in every episode, whatever the strategy; ['none']: victims are drawn by "
+        "crash_rate (an empty list has no type in ROS and is refused).",
     ),
     "alpha_max": ParameterSpec(
         "alpha_max",
@@ -253,7 +253,7 @@ def check_change(settings: ControlSettings, changed: Sequence[str]) -> None:
             f"{asked[0]} would have no effect: enabled is false (as /coach/clear_all leaves it); "
             "set enabled to true first, or in the same call"
         )
-    if coach.strategy == "none":
+    if coach.strategy == "none" and not coach.victims:
         raise UserError(f"{asked[0]} would have no effect: strategy is none; set fixed, for one")
 
 

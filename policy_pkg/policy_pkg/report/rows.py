@@ -81,7 +81,7 @@ class Improvement:
 def exactly_crashed(condition: Condition) -> int | None:
     """How many robots the condition crashes, where it draws exactly so many."""
     crash = condition.crash
-    if crash.strategy == "none":
+    if crash.strategy == "none" and not crash.victims:
         return 0
     return crash.crashed_exactly if crash.crashed_exactly >= 0 else None
 

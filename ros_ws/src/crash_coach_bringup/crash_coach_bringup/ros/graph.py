@@ -31,6 +31,11 @@ class GraphError(UserError):
     """The graph cannot be started as asked; the text says what is wrong."""
 
 
+def nobody_yet() -> CoachConfig:
+    """Nobody crashes until victims are named or ``crash_rate`` is set, then as ``at_rate`` does."""
+    return CoachConfig(strategy="fixed", resample=False)
+
+
 @dataclass(frozen=True)
 class UpOptions:
     """A graph: which scenario, which policies, how many processes.
@@ -54,7 +59,7 @@ class UpOptions:
     autostart: bool = True
     gate: bool = True
     epsilon: float = 0.0
-    coach: CoachConfig = field(default_factory=CoachConfig)
+    coach: CoachConfig = field(default_factory=nobody_yet)
     fault_scenario: Path | None = None
     relay_observations: bool = False
     sim: Mapping[str, Value] = field(default_factory=dict)

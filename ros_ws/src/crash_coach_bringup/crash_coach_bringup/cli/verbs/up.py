@@ -10,7 +10,7 @@ import typer
 
 from crash_coach_bringup.cli.output import CliError
 from crash_coach_bringup.cli.verbs.evaluate import Layout, LayoutOption
-from policy_pkg.play.conditions import at_rate, crash_free
+from policy_pkg.play.conditions import at_rate
 
 if TYPE_CHECKING:
     from crash_coach_bringup.ros.supervisor import Event
@@ -69,7 +69,7 @@ def up(
         episodes=episodes,
         seed=seed,
         epsilon=epsilon,
-        coach=(at_rate(crash_rate) if crash_rate > 0 else crash_free()).crash,
+        coach=at_rate(crash_rate).crash,
         relay_observations=relay_observations,
         log_dir=logs,
     )
