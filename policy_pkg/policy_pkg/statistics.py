@@ -84,6 +84,25 @@ def reweighted_success(
     return Estimate(value, max(0.0, value - math.sqrt(below)), min(1.0, high))
 
 
+def mean_of(estimates: Sequence[Estimate]) -> Estimate:
+    """The mean of independent estimates; their intervals are combined by MOVER, as above."""
+    n = len(estimates)
+    value = sum(each.value for each in estimates) / n
+    below = math.sqrt(sum((each.value - each.low) ** 2 for each in estimates)) / n
+    above = math.sqrt(sum((each.high - each.value) ** 2 for each in estimates)) / n
+    return Estimate(value, value - below, value + above)
+
+
+def difference(first: Estimate, second: Estimate) -> Estimate:
+    """``first`` - ``second``: Newcombe's interval of a difference of two rates (1998, method 10),
+    where both have Wilson's. Rates of the same episodes (paired) go together: it is then too wide.
+    """
+    value = first.value - second.value
+    below = math.hypot(first.value - first.low, second.high - second.value)
+    above = math.hypot(first.high - first.value, second.value - second.low)
+    return Estimate(value, value - below, value + above)
+
+
 def mean_interval(scores: npt.NDArray[np.float64], confidence: float = 0.95) -> Estimate:
     """Mean over seeds with Student's t interval, the one that holds with three to five seeds.
 

@@ -8,7 +8,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from in_process import refused
+from in_process import refused, typed
 
 from crash_coach_bringup.cli.main import repeat_options
 from crash_coach_bringup.cli.options import conditions, mode_parameters
@@ -171,6 +171,30 @@ def test_evaluate_writes_what_it_prints(checkpoint: Path, tmp_path: Path) -> Non
     assert [len(c["per_episode"]) for c in result["conditions"]] == [4, 4]
     assert [len(e["crashed"]) for e in result["conditions"][1]["per_episode"]] == [1] * 4
     assert result["trajectory_hash"] in done.stdout
+
+
+def test_evaluate_tells_what_each_robot_costs(tmp_path: Path) -> None:
+    out = tmp_path / "result.json"
+    team = ("evaluate", "scripted:coverage_adaptive", "--scenario", "coverage")
+    done = typed(*team, "--episodes", "8", "--each-robot", "--json", str(out))
+    assert done.returncode == 0, done.stderr
+    free, *alone = json.loads(out.read_text())["conditions"]
+    robots = [f"robot_{i + 1}" for i in range(len(alone))]
+    assert [c["name"] for c in alone] == [f"{robot} stay" for robot in robots]
+    assert "cost" not in free
+    for condition in alone:
+        assert condition["cost"] == free["success_rate"] - condition["success_rate"]
+        low, high = condition["cost_ci95"]
+        assert low <= condition["cost"] <= high
+    # Those first that cost most; robots that cost the same in their order.
+    costs = {condition["name"]: -condition["cost"] for condition in alone}
+    shown = [line.split("│")[1].strip() for line in done.stdout.splitlines() if " stay " in line]
+    assert shown == sorted(costs, key=costs.__getitem__)
+    # A single condition is held against the crash-free one as well.
+    typed(*team, "--episodes", "4", "--victims", "robot_1", "--json", str(out))
+    assert [c["name"] for c in json.loads(out.read_text())["conditions"]] == [
+        "crash-free", "robot_1 stay",
+    ]  # fmt: skip
 
 
 def test_bad_input_names_the_thing(checkpoint: Path, tmp_path: Path) -> None:

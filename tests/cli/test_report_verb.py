@@ -41,13 +41,16 @@ def test_report_of_two_methods(
     found = results_of(out)
     assert [(row["condition"], row["method"], row["seeds"]) for row in found["rows"]] == [
         (condition, method, seeds)
-        for condition in ("crash-free", "1 crashed", "rate 0.1", "rate 0.1, re-weighted")
+        for condition in (
+            *("crash-free", "1 crashed", "rate 0.1"),
+            *("rate 0.1, re-weighted", "mean over k = 0, 1"),
+        )
         for method, seeds in (("qmix", [0, 1, 2]), ("vdn", [10, 11, 12]))
     ]
     for row in found["rows"]:
         mean = sum(row["success"]) / 3
         assert row["interval"]["low"] <= mean <= row["interval"]["high"]
-    reweighted = found["rows"][-1]
+    reweighted = found["rows"][7]
     free, one = (found["rows"][k]["success"] for k in (1, 3))
     # Two robots: both crashed was not measured and counts as a failure.
     expected = [0.81 * a + 0.18 * b for a, b in zip(free, one, strict=True)]
@@ -59,7 +62,8 @@ def test_report_of_two_methods(
     assert found["runs"][0]["wall_s"] == 80.0
     text = (out / "table.md").read_text()
     overview = text.split("### buttons\n")[1].splitlines()
-    assert overview[1] == "| method | crash-free | 1 crashed | rate 0.1 | rate 0.1, re-weighted |"
+    columns = ["method", *dict.fromkeys(row["condition"] for row in found["rows"])]
+    assert overview[1] == f"| {' | '.join(columns)} |"
     cells = [line.strip("| ").split(" | ") for line in overview[3:5]]
     assert [line[0] for line in cells] == ["qmix", "vdn"]
     means = [sum(row["success"]) / 3 for row in found["rows"]]
@@ -123,7 +127,7 @@ def test_it_goes_on_where_it_was_left_and_repeats_every_digit(
 
 def test_a_single_seed_has_wilsons_interval(runs: Path, tmp_path: Path) -> None:
     report([runs / "vdn-s0"], out=tmp_path, episodes=8, crashed=[1, 0])
-    row, free = results_of(tmp_path)["rows"]
+    row, free, _ = results_of(tmp_path)["rows"]
     assert row["iqm"] is None
     assert (row["alike"], free["alike"], free["interval"]) == (False, True, None)
     assert row["interval"]["high"] - row["interval"]["low"] > 0.2
@@ -137,10 +141,33 @@ def test_one_episode_per_run_counts_over_seeds(runs: Path, tmp_path: Path) -> No
     folders = [runs / f"qmix-s{seed}" for seed in range(3)]
     report(folders, out=tmp_path, episodes=1, crashed=[0], each_robot=True, mode="stay")
     found = results_of(tmp_path)["rows"]
-    assert [row["condition"] for row in found] == ["crash-free", "robot_1 stay", "robot_2 stay"]
+    assert [row["condition"] for row in found] == [
+        "crash-free", "robot_1 stay", "robot_2 stay", "worst victim",
+    ]  # fmt: skip
     # Wilson over three seeds, not Student's t, which has no width here.
     assert found[0]["success"] == [0.0] * 3
     assert found[0]["interval"]["high"] == pytest.approx(0.5615, abs=1e-4)
+
+
+def test_who_hurts_most(runs: Path, tmp_path: Path) -> None:
+    folders = [runs / f"{method}-s{seed}" for method in ("qmix", "vdn") for seed in range(3)]
+    report(folders, out=tmp_path, episodes=6, crashed=[0, 1], each_robot=True, mode="random")
+    found = results_of(tmp_path)
+    rows = {(row["condition"], row["method"]): row for row in found["rows"]}
+    mean, worst = rows["mean over k = 0, 1", "vdn"], rows["worst victim", "vdn"]
+    both = [rows[condition, "vdn"]["success"] for condition in ("crash-free", "1 crashed")]
+    assert mean["success"] == pytest.approx([(a + b) / 2 for a, b in zip(*both, strict=True)])
+    alone = [rows[f"robot_{i} random", "vdn"]["success"] for i in (1, 2)]
+    assert worst["success"] == [min(pair) for pair in zip(*alone, strict=True)]
+    (first, *_) = found["costs"]
+    free = rows["crash-free", first["method"]]["success"]
+    with_it = rows[f"{first['victim']} random", first["method"]]["success"]
+    assert first["values"] == pytest.approx([a - b for a, b in zip(free, with_it, strict=True)])
+    text = (tmp_path / "table.md").read_text()
+    assert "| method | crash-free | 1 crashed | mean over k = 0, 1 | worst victim |" in text
+    section = text.split("## Who hurts most")[1].split("## Intervals")[0]
+    assert section.count("\n| robot_") == 2
+    assert (tmp_path / "victims.png").stat().st_size > 500
 
 
 def test_maps_are_also_taken_together(tmp_path: Path) -> None:
@@ -182,15 +209,21 @@ def test_unfinished_runs_and_uneven_lengths_are_named(tmp_path: Path) -> None:
             None, None, False,
             ["crash-free", "1 crashed", "2 crashed", "rate 0.01", "rate 0.05", "rate 0.1"],
         ),
-        ([1, 0, 1], None, False, ["1 crashed", "crash-free"]),
-        (None, [0.3], False, ["rate 0.3"]),
+        (
+            None, None, None,
+            ["crash-free", "1 crashed", "2 crashed", "rate 0.01", "rate 0.05", "rate 0.1",
+             "robot_1 mute", "robot_2 mute"],
+        ),
+        ([1, 0, 1], None, None, ["1 crashed", "crash-free"]),
+        (None, [0.3], None, ["rate 0.3"]),
+        ([1], None, True, ["crash-free", "1 crashed", "robot_1 mute", "robot_2 mute"]),
         ([0], [0.3], True, ["crash-free", "rate 0.3", "robot_1 mute", "robot_2 mute"]),
     ],
 )  # fmt: skip
 def test_conditions(
     crashed: Sequence[int] | None,
     rates: Sequence[float] | None,
-    each_robot: bool,
+    each_robot: bool | None,
     names: list[str],
 ) -> None:
     found = asked(("robot_1", "robot_2"), crashed, rates, each_robot, "mute", {})

@@ -13,8 +13,10 @@ from crash_coach_common.contract import UserError
 from policy_pkg.statistics import (
     binomial_weights,
     bootstrap_interquartile_mean,
+    difference,
     interquartile_mean,
     mean_interval,
+    mean_of,
     probability_of_improvement,
     reweighted_success,
     wilson,
@@ -67,6 +69,25 @@ def test_an_unmeasured_stratum_widens_only_the_upper_bound() -> None:
         reweighted_success({0: (1, 1)}, 2, 1.5)
     with pytest.raises(ValueError, match=r"\[5\] crashed of 2"):
         reweighted_success({5: (1, 1)}, 2, 0.1)
+
+
+def test_a_known_stratum_has_no_width() -> None:
+    known = reweighted_success({0: (8, 8), 1: (0, 8), 2: (0, 8)}, 2, 0.3, frozenset({0, 1, 2}))
+    assert known.low == known.value == known.high == pytest.approx(0.49)
+
+
+def test_newcombes_interval_of_a_difference() -> None:
+    """Example (a) of Newcombe (1998), table II, method 10."""
+    found = difference(wilson(56, 70), wilson(48, 80))
+    assert [found.value, found.low, found.high] == pytest.approx([0.2, 0.0524, 0.3339], abs=5e-5)
+
+
+def test_the_mean_of_estimates_is_narrower_than_each() -> None:
+    one = wilson(30, 40)
+    assert mean_of([one]) == one
+    four = mean_of([one] * 4)
+    assert four.value == pytest.approx(0.75)
+    assert four.high - four.value == pytest.approx((one.high - one.value) / 2)
 
 
 def test_interquartile_mean() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -20,11 +20,15 @@ class Condition:
     """Under which crashes of a coach a policy is evaluated.
 
     ``drawn``: whether victims or effects may be drawn in each episode.
+    ``crashed``: exactly so many robots; None where the condition says something else.
+    ``victim``: the robot that it is about; "" where it is about none, or several.
     """
 
     name: str
     crash: CoachConfig
     drawn: bool = True
+    crashed: int | None = None
+    victim: str = ""
 
 
 @dataclass(frozen=True)
@@ -40,31 +44,32 @@ class Planned:
 
 
 def crash_free() -> Condition:
-    return Condition("crash-free", CoachConfig(), drawn=False)
+    return Condition("crash-free", CoachConfig(), drawn=False, crashed=0)
 
 
 def at_rate(rate: float, mode: str = "mute", parameters: Parameters = NO_PARAMETERS) -> Condition:
     """Every robot crashes on its own with probability ``rate``; no re-sampling (the paper's)."""
     who = {"crash_rate": rate, "resample": False}
-    return _fixed(f"rate {rate:g}", who, mode, parameters, drawn=0 < rate < 1)
+    condition = _fixed(f"rate {rate:g}", who, mode, parameters)
+    return replace(condition, drawn=condition.drawn or 0 < rate < 1)
 
 
 def exactly(count: int, mode: str = "mute", parameters: Parameters = NO_PARAMETERS) -> Condition:
     """``count`` uniformly drawn robots crash in every episode."""
-    return _fixed(f"{count} crashed", {"crashed_exactly": count}, mode, parameters, drawn=count > 0)
+    condition = _fixed(f"{count} crashed", {"crashed_exactly": count}, mode, parameters)
+    return replace(condition, drawn=count > 0, crashed=count)
 
 
 def named(
     victims: Sequence[str], mode: str = "mute", parameters: Parameters = NO_PARAMETERS
 ) -> Condition:
     """These robots crash in every episode."""
-    return _fixed(f"{', '.join(victims)} {mode}", {"victims": tuple(victims)}, mode, parameters)
+    who = {"victims": tuple(victims)}
+    condition = _fixed(f"{', '.join(victims)} {mode}", who, mode, parameters)
+    return replace(condition, victim=victims[0] if len(victims) == 1 else "")
 
 
-def _fixed(
-    name: str, who: dict[str, Any], mode: str, parameters: Parameters, drawn: bool = False
-) -> Condition:
-    """``drawn``: whether the victims are."""
+def _fixed(name: str, who: dict[str, Any], mode: str, parameters: Parameters) -> Condition:
     how = {"strategy": "fixed", "crash_mode": mode, "crash_parameters": dict(parameters)}
     crash = CoachConfig.model_validate({**how, **who})
-    return Condition(name, crash, drawn or fault_mode(mode).draws)
+    return Condition(name, crash, fault_mode(mode).draws)

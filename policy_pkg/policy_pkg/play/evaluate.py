@@ -19,7 +19,7 @@ from policy_pkg.play.arenas import ArenaArray, Arenas, Executed
 from policy_pkg.play.conditions import Condition, Planned
 from policy_pkg.play.teams import RecurrentTeam, ScriptedTeam, Team, offers
 from policy_pkg.policy import RecurrentPolicy
-from policy_pkg.statistics import wilson
+from policy_pkg.statistics import Estimate, wilson
 from sim_pkg.env import Env, make_env
 from sim_pkg.render.frames import Frames, Recorder
 from sim_pkg.scripted import make_scripted
@@ -73,11 +73,18 @@ class Evaluation:
         left = self.drawn and not all(len(e.crashed) == len(self.robots) for e in self.episodes)
         return len(self.episodes) > 1 and len(courses) == 1 and not left
 
+    @property
+    def success(self) -> Estimate:
+        """The success rate with Wilson's 95 % interval; without any width where ``alike``."""
+        if self.alike:
+            return Estimate(self.success_rate, self.success_rate, self.success_rate)
+        return wilson(sum(e.success for e in self.episodes), len(self.episodes))
+
     def summary(self) -> dict[str, Any]:
         """JSON values. ``return_std`` is the sample's; ``crashed_fraction`` is per robot;
         ``success_ci95`` is null where the episodes are ``alike``."""
         returns = np.array([e.episode_return for e in self.episodes])
-        interval = wilson(sum(e.success for e in self.episodes), len(self.episodes))
+        interval = self.success
         crashed = sum(len(e.crashed) for e in self.episodes)
         return {
             "success_rate": self.success_rate,

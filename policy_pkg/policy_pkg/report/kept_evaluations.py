@@ -14,6 +14,7 @@ from policy_pkg.checkpoint import load_policy
 from policy_pkg.play.conditions import Condition
 from policy_pkg.play.evaluate import evaluate
 from policy_pkg.report.finished_runs import Run
+from policy_pkg.statistics import Estimate, wilson
 from policy_pkg.train.run_dir import RunError
 from sim_pkg.env import make_env
 
@@ -37,6 +38,13 @@ class Outcome:
     @property
     def success(self) -> float:
         return self.successes / self.episodes
+
+    @property
+    def estimate(self) -> Estimate:
+        """Success rate with Wilson's interval; without width where nothing is left to chance."""
+        if self.alike:
+            return Estimate(self.success, self.success, self.success)
+        return wilson(self.successes, self.episodes)
 
     @property
     def counts(self) -> tuple[int, int]:

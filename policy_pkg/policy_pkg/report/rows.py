@@ -9,7 +9,6 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
-from policy_pkg.play.conditions import Condition
 from policy_pkg.report.finished_runs import methods_of
 from policy_pkg.report.kept_evaluations import Result, arena
 from policy_pkg.statistics import (
@@ -17,12 +16,14 @@ from policy_pkg.statistics import (
     binomial_weights,
     bootstrap_interquartile_mean,
     mean_interval,
+    mean_of,
     probability_of_improvement,
     reweighted_success,
     wilson,
 )
 
 ALL_MAPS = "all maps"
+WORST_VICTIM = "worst victim"
 Scores = npt.NDArray[np.float64]
 LEAST_SEEDS = 3  # of either method and map, for a probability of improvement
 
@@ -40,7 +41,7 @@ class Row:
     ``not_measured``: probability of the numbers of crashed robots that a re-weighted estimate has
     no result for and counts as failures.
     ``alike``: of every seed all episodes are the same one, with nothing left to chance.
-    ``crashed``: exactly so many robots; None where the condition says something else.
+    ``crashed``, ``victim``: as of the condition.
     """
 
     scenario: str
@@ -54,6 +55,7 @@ class Row:
     not_measured: float = 0.0
     alike: bool = False
     crashed: int | None = None
+    victim: str = ""
 
     @property
     def mean(self) -> float:
@@ -78,16 +80,11 @@ class Improvement:
     estimate: Estimate
 
 
-def exactly_crashed(condition: Condition) -> int | None:
-    """How many robots the condition crashes, where it draws exactly so many."""
-    crash = condition.crash
-    if crash.strategy == "none" and not crash.victims:
-        return 0
-    return crash.crashed_exactly if crash.crashed_exactly >= 0 else None
-
-
 def rows(results: Sequence[Result], rates: Sequence[float]) -> list[Row]:
     """A row per map, condition and method; then those over all maps, where there are several.
+
+    Behind the conditions that were played come those that follow from them: the rates, the mean
+    over exact numbers of crashed robots, and each run's worst victim.
 
     Args:
         results: of all runs, with the same conditions on the same map; their order is that of
@@ -110,6 +107,8 @@ def rows(results: Sequence[Result], rates: Sequence[float]) -> list[Row]:
             found += [_measured(group, index) for group in methods.values()]
         for rate in rates:
             found += [_reweighted(group, rate) for group in methods.values()]
+        for summary in (_mean_over_crashed, _worst_victim):
+            found += [row for group in methods.values() if (row := summary(group)) is not None]
     return found + _over_maps(found, tuple(groups))
 
 
@@ -117,19 +116,19 @@ def _measured(group: Sequence[Result], index: int) -> Row:
     condition = group[0].outcomes[index][0]
     outcomes = [result.outcomes[index][1] for result in group]
     counts = [outcome.counts for outcome in outcomes]
-    single = [wilson(*count) for count in counts]
+    single = [outcome.estimate for outcome in outcomes]
     row = _row(
         group,
         condition.name,
         single,
         returns=tuple(outcome.return_mean for outcome in outcomes),
-        crashed=exactly_crashed(condition),
+        crashed=condition.crashed,
     )
-    row = replace(row, alike=all(outcome.alike for outcome in outcomes))
+    row = replace(row, alike=all(outcome.alike for outcome in outcomes), victim=condition.victim)
     if any(episodes > 1 for _, episodes in counts):
         return row
     if len(counts) == 1:
-        return replace(row, interval=None)
+        return replace(row, interval=None)  # of one episode
     # Each seed is one success or failure: the counts have no normal distribution.
     return replace(row, interval=wilson(sum(successes for successes, _ in counts), len(counts)))
 
@@ -139,9 +138,9 @@ def _reweighted(group: Sequence[Result], rate: float) -> Row:
     single, missing = [], 0.0
     for result in group:
         exact = {
-            k: outcome
+            condition.crashed: outcome
             for condition, outcome in result.outcomes
-            if (k := exactly_crashed(condition)) is not None
+            if condition.crashed is not None
         }
         counts = {k: (outcome.successes, outcome.episodes) for k, outcome in exact.items()}
         known = frozenset(k for k, outcome in exact.items() if outcome.alike)
@@ -149,6 +148,29 @@ def _reweighted(group: Sequence[Result], rate: float) -> Row:
         weights = binomial_weights(n, rate)
         missing = sum(weight for k, weight in enumerate(weights) if k not in exact)
     return _row(group, f"rate {rate:g}, re-weighted", single, not_measured=missing)
+
+
+def _mean_over_crashed(group: Sequence[Result]) -> Row | None:
+    """Each run's mean over exact numbers of crashed robots; None with less than two numbers."""
+    exact = sorted({c.crashed for c, _ in group[0].outcomes if c.crashed is not None})
+    if len(exact) < 2:
+        return None
+    single = [
+        mean_of([o.estimate for c, o in result.outcomes if c.crashed is not None])
+        for result in group
+    ]
+    return _row(group, f"mean over k = {', '.join(map(str, exact))}", single)
+
+
+def _worst_victim(group: Sequence[Result]) -> Row | None:
+    """Each run's success with the robot crashed that hurts it most; None without victims."""
+    single = []
+    for result in group:
+        victims = [outcome.estimate for c, outcome in result.outcomes if c.victim]
+        if len(victims) < 2:
+            return None
+        single.append(min(victims, key=lambda estimate: estimate.value))
+    return _row(group, WORST_VICTIM, single)
 
 
 def _row(
@@ -163,13 +185,16 @@ def _row(
     scores = np.array([estimate.value for estimate in single])
     several = len(single) > 1
     interval = mean_interval(scores) if several else single[0]
+    known = not several and interval.low == interval.high  # nothing was left to chance
     return Row(
         scenario=group[0].run.scenario,
         condition=condition,
         method=group[0].run.method,
         seeds=tuple(result.run.seed for result in group),
         success=tuple(scores.tolist()),
-        interval=Estimate(interval.value, max(0.0, interval.low), min(1.0, interval.high)),
+        interval=None
+        if known
+        else Estimate(interval.value, max(0.0, interval.low), min(1.0, interval.high)),
         iqm=bootstrap_interquartile_mean([scores], _draws()) if several else None,
         returns=returns,
         not_measured=not_measured,

@@ -56,6 +56,25 @@ def mode_parameters(mode: str, given: list[str]) -> dict[str, float]:
     return parameters
 
 
+def with_each_robot(
+    asked: list[Condition],
+    robots: tuple[str, ...],
+    each_robot: bool,
+    mode: str,
+    parameters: Mapping[str, float],
+) -> list[Condition]:
+    """``asked``, with every robot alone if so wanted, and behind the crash-free condition, which
+    tells what the others cost."""
+    found = asked
+    if each_robot:
+        alone = [named([robot], mode, parameters) for robot in robots]
+        # Without another crash option all that was asked for is crash-free.
+        found = [*asked, *(c for c in alone if c not in asked)]
+    if any(condition.crashed == 0 for condition in found):
+        return found
+    return [crash_free(), *found]
+
+
 def conditions(
     robots: tuple[str, ...],
     rates: list[float],

@@ -8,12 +8,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
+from crash_coach_bringup.cli.fitted_table import FittedConsole, FittedTable
 from crash_coach_common.contract import UserError
+from policy_pkg.statistics import Estimate
 
-console = Console()
+console = FittedConsole()
 
 
 class CliError(UserError):
@@ -57,12 +56,21 @@ def check_json_target(path: Path | None) -> None:
         check_file_target("--json", path)
 
 
-def table(title: str, columns: list[str]) -> Table:
+def table(title: str, columns: list[str]) -> FittedTable:
     """A table whose first column is text and whose others are figures."""
-    out = Table(title=title, title_justify="left")
+    out = FittedTable(title=title, title_justify="left")
     for index, column in enumerate(columns):
         out.add_column(column, justify="left" if index == 0 else "right")
     return out
+
+
+def points(cost: Estimate) -> str:
+    """'+83.2 (+75.0..+88.9)', of a cost in points of success; without a width only the first."""
+    low, middle, high = (
+        f"{round(100 * value, 9) + 0.0:+.1f}".replace("-", "−")
+        for value in (cost.low, cost.value, cost.high)
+    )
+    return middle if low == high else f"{middle} ({low}..{high})"
 
 
 def percent_ci(rate: float, interval: Sequence[float] | None) -> str:

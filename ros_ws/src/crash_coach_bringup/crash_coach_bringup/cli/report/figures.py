@@ -14,18 +14,24 @@ from crash_coach_bringup.cli.picture import TeamResults, draw_first_episodes
 from crash_coach_bringup.cli.report.curves import learning_curves
 from crash_coach_bringup.cli.report.panels import COLUMNS, legend_above, panels
 from crash_coach_bringup.cli.report.success import in_recordings, success
+from crash_coach_bringup.cli.report.victims import victims
 from crash_coach_bringup.cli.verbs.plot import COLOURS, FORMATS, INK, save, style
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.play.evaluate import evaluate
 from policy_pkg.report.finished_runs import Run, methods_of
 from policy_pkg.report.kept_evaluations import Result
 from policy_pkg.report.rows import ALL_MAPS, Improvement, Row
+from policy_pkg.report.victims import Cost
 
 APART = 0.06  # between the methods' points at the same number of crashed robots
 
 
 def write(
-    rows: Sequence[Row], better: Sequence[Improvement], runs: Sequence[Run], out: Path
+    rows: Sequence[Row],
+    better: Sequence[Improvement],
+    costs: Sequence[Cost],
+    runs: Sequence[Run],
+    out: Path,
 ) -> list[Path]:
     """Draws what rows and runs suffice for, as PNG and SVG; returns the files.
 
@@ -40,6 +46,8 @@ def write(
         figures["resilience"] = resilience(exact, methods)
     if exact:
         figures["success"] = success(exact, in_recordings(runs))
+    if costs:
+        figures["victims"] = victims(rows, costs, methods)
     if (curves := learning_curves(runs, methods)) is not None:
         figures["curves"] = curves
     if better:

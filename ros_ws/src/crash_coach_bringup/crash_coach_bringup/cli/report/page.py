@@ -8,15 +8,22 @@ from typing import Any
 from crash_coach_bringup.cli.markdown import table
 from policy_pkg.report.paired import LEAST_PAIRS, PairedDifference
 from policy_pkg.report.rows import ALL_MAPS, Row, best
+from policy_pkg.report.victims import Cost
 from policy_pkg.statistics import Estimate
 
 NONE = "–"
+VICTIMS = (
+    "Success in % with this robot alone crashed and, in brackets, what that costs: how much lower "
+    "it is than crash-free, in points; ± half the width of its 95 % interval. Who costs most, on "
+    "average over the methods, comes first."
+)
 
 
 def page(
     about: Mapping[str, Any],
     rows: Sequence[Row],
     paired: Sequence[PairedDifference],
+    costs: Sequence[Cost],
     runs: Sequence[Mapping[str, Any]],
     differences: Sequence[str],
 ) -> str:
@@ -34,6 +41,8 @@ def page(
     if len({row.method for row in rows}) > 1:
         parts += ["## Methods", "Mean ± sample standard deviation over seeds; best in bold."]
         parts += _overview(rows)
+    if costs:
+        parts += ["## Who hurts most", VICTIMS, *_victims(costs)]
     if about["against"]:
         parts += ["## Differences", *_differences(paired)]
     parts += ["## Intervals", _meaning(rows), _details(rows)]
@@ -78,7 +87,9 @@ def _overview(rows: Sequence[Row]) -> list[str]:
         maps.setdefault(row.scenario, {}).setdefault(row.method, {})[row.condition] = text
     out = []
     for name, methods in maps.items():
-        conditions = list(dict.fromkeys(row.condition for row in rows if row.scenario == name))
+        # Victims have a table of their own.
+        here = [row for row in rows if row.scenario == name and not row.victim]
+        conditions = list(dict.fromkeys(row.condition for row in here))
         lines = [[m, *(cells.get(c, NONE) for c in conditions)] for m, cells in methods.items()]
         out += [f"### {name}", table(["method", *conditions], lines)]
     return out
@@ -102,6 +113,24 @@ def _differences(paired: Sequence[PairedDifference]) -> list[str]:
                 lines.setdefault(f"{each.method} − {each.against}", {})[each.scenario] = text
         cells = [[pair, *(of.get(name, NONE) for name in maps)] for pair, of in lines.items()]
         out += [f"### {condition}", table(["difference", *maps], cells)]
+    return out
+
+
+def _victims(costs: Sequence[Cost]) -> list[str]:
+    """A table per map: victims down, methods across."""
+    out = []
+    for name in dict.fromkeys(each.scenario for each in costs):
+        here = [each for each in costs if each.scenario == name]
+        methods = list(dict.fromkeys(each.method for each in here))
+        victims: dict[str, dict[str, str]] = {}
+        for each in here:
+            cost = f"{round(100 * each.mean, 9):+.1f}"
+            if each.interval is not None:
+                cost += f" ± {figure((each.interval.high - each.interval.low) / 2)}"
+            text = f"{figure(each.success)} ({cost.replace('-', '−')})"
+            victims.setdefault(each.victim, {})[each.method] = text
+        lines = [[v, *(cells.get(m, NONE) for m in methods)] for v, cells in victims.items()]
+        out += [f"### {name}", table(["crashed", *methods], lines)]
     return out
 
 
@@ -136,7 +165,11 @@ def _details(rows: Sequence[Row]) -> str:
 
 
 def _runs(runs: Sequence[Mapping[str, Any]]) -> str:
-    names = list(dict.fromkeys(name for run in runs for name in run["outcomes"]))
+    names = list(
+        dict.fromkeys(
+            name for run in runs for name in run["outcomes"] if name not in run["victims"]
+        )
+    )
     lines = []
     for run in runs:
         alpha = NONE if run["new_alpha"] is None else f"{run['new_alpha']:.2f}"

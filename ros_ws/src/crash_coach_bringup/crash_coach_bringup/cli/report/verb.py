@@ -26,7 +26,8 @@ from policy_pkg.report.finished_runs import (
 )
 from policy_pkg.report.kept_evaluations import Evaluations, Result, arena
 from policy_pkg.report.paired import paired_differences
-from policy_pkg.report.rows import Row, exactly_crashed, improvements, rows
+from policy_pkg.report.rows import Row, improvements, rows
+from policy_pkg.report.victims import costs
 
 CRASHED = (0, 1, 2)
 RATES = (0.01, 0.05, 0.1)
@@ -36,20 +37,26 @@ def asked(
     robots: tuple[str, ...],
     crashed: Sequence[int] | None,
     rates: Sequence[float] | None,
-    each_robot: bool,
+    each_robot: bool | None,
     mode: str,
     parameters: Mapping[str, float],
 ) -> list[Condition]:
-    """The conditions, exact numbers first; without any option all that a result should state."""
+    """The conditions, exact numbers first; without any option all that a result should state.
+
+    What a victim costs needs the crash-free episodes.
+    """
     if not crashed and not rates and not each_robot:
         crashed, rates = [k for k in CRASHED if k <= len(robots)], RATES
+        each_robot = each_robot is None
+    elif each_robot and 0 not in (crashed or []):
+        crashed = [0, *(crashed or [])]
     counts, drawn = list(dict.fromkeys(crashed or [])), list(dict.fromkeys(rates or []))
     if not counts and not drawn:
         found = []
     else:
         found = conditions(robots, drawn, counts, [], mode, parameters)
         found = [*found[len(drawn) :], *found[: len(drawn)]]
-    found = [crash_free() if exactly_crashed(c) == 0 else c for c in found]
+    found = [crash_free() if c.crashed == 0 else c for c in found]
     if each_robot:
         found += [named([robot], mode, parameters) for robot in robots]
     return found
@@ -71,7 +78,13 @@ RateOption = Annotated[
     ),
 ]
 EachRobotOption = Annotated[
-    bool, typer.Option("--each-robot", help="Also each robot alone, in every episode.")
+    bool | None,
+    typer.Option(
+        "--each-robot/--no-each-robot",
+        help="Also each robot alone, in every episode: who hurts most. "
+        "[default: yes, or no where another crash option is given]",
+        show_default=False,
+    ),
 ]
 TrajectoriesOption = Annotated[
     int | None,
@@ -93,7 +106,7 @@ def report(
     ] = 128,
     crashed: CrashedOption = None,
     crash_rate: RateOption = None,
-    each_robot: EachRobotOption = False,
+    each_robot: EachRobotOption = None,
     mode: ModeOption = "mute",
     param: ParamOption = None,
     seed: Annotated[int, typer.Option(help="Of the episodes, the same for every run.", min=0)] = 0,
@@ -113,7 +126,7 @@ def report(
         name: asked(arena(name)[0], crashed, crash_rate, each_robot, mode, parameters)
         for name in dict.fromkeys(run.scenario for run in runs)
     }
-    exact = any(exactly_crashed(c) is not None for found in wanted.values() for c in found)
+    exact = any(c.crashed is not None for found in wanted.values() for c in found)
     rates = crash_rate or ([] if crashed or each_robot else RATES)
     about = {
         "episodes": episodes,
@@ -179,6 +192,7 @@ def describe(result: Result) -> dict[str, Any]:
         "gradient_steps": metrics.get("gradient_steps"),
         "new_alpha": metrics.get("new_alpha"),
         "wall_s": wall_time_s(run.path),
+        "victims": {c.name: c.victim for c, _ in result.outcomes if c.victim},
         "outcomes": {condition.name: asdict(outcome) for condition, outcome in result.outcomes},
     }
 
@@ -194,12 +208,14 @@ def _write(
     better = improvements(found)
     described = [describe(result) for result in results]
     paired = paired_differences(found, about["against"])
-    text = page(about, found, paired, described, differences([each.run for each in results]))
+    cost = costs(found)
+    text = page(about, found, paired, cost, described, differences([each.run for each in results]))
     (out / "table.md").write_text(text, encoding="utf-8")
     content = {
         **about,
         "rows": [asdict(row) for row in found],
         "paired_differences": [asdict(each) for each in paired],
+        "costs": [asdict(each) for each in cost],
         "improvements": [asdict(each) for each in better],
         "runs": described,
     }
@@ -207,7 +223,7 @@ def _write(
     # Imported here: no other verb should wait for matplotlib.
     from crash_coach_bringup.cli.report import figures as report_figures
 
-    drawn = report_figures.write(found, better, [each.run for each in results], out)
+    drawn = report_figures.write(found, better, cost, [each.run for each in results], out)
     if run_seed is not None:
         drawn.append(report_figures.trajectories(results, run_seed, about["seed"], out))
     console.print(text, markup=False, highlight=False, soft_wrap=True)

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from crash_coach_bringup.cli.output import CliError, console
+from policy_pkg.report.collect import collect as collect_run
 from policy_pkg.report.finished_runs import find_runs
-from policy_pkg.train.collect import collect as collect_run
 
 
 def collect(

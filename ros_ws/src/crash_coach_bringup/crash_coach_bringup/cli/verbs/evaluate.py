@@ -15,12 +15,14 @@ from crash_coach_bringup.cli.options import (
     ParamOption,
     conditions,
     mode_parameters,
+    with_each_robot,
 )
 from crash_coach_bringup.cli.output import (
     CliError,
     check_json_target,
     console,
     percent_ci,
+    points,
     table,
     write_json,
 )
@@ -28,10 +30,12 @@ from crash_coach_bringup.cli.target import HELP, Target, load_target
 from policy_pkg.play.conditions import Condition
 from policy_pkg.play.evaluate import Evaluation, Scripted
 from policy_pkg.play.evaluate_processes import evaluate_on
+from policy_pkg.statistics import Estimate, difference
 from sim_pkg.trajectory import combine
 
 MOST_EPISODES = 1_000_000
 MOST_PROCESSES = 1024
+COST = "cost: how much lower success is than crash-free, in points (95 % interval)."
 ALIKE = "1 episode: all went alike and nothing in them is left to chance, so there is no interval."
 
 
@@ -64,6 +68,11 @@ ProcessesOption = Annotated[
 ]
 
 
+EachRobotOption = Annotated[
+    bool, typer.Option("--each-robot", help="Each robot alone, in every episode: who hurts most.")
+]
+
+
 def play(
     target: Target,
     conditions: list[Condition],
@@ -93,19 +102,32 @@ def play(
     ]
 
 
+def cost(free: Evaluation, crashed: Evaluation) -> Estimate:
+    """How much lower the success rate is than ``free``'s."""
+    return difference(free.success, crashed.success)
+
+
 def show(title: str, results: list[tuple[Condition, Evaluation]]) -> None:
-    rows = table(title, ["condition", "success (95 % interval)", "return", "steps", "crashed"])
-    for condition, result in results:
+    """Victims come last, those first that cost most."""
+    free = next((result for condition, result in results if condition.crashed == 0), None)
+    others = [each for each in results if not each[0].victim]
+    victims = sorted((r for r in results if r[0].victim), key=lambda r: r[1].success_rate)
+    columns = ["condition", "success (95 % interval)", "cost", "return", "steps", "crashed"]
+    rows = table(title, columns)
+    for condition, result in others + victims:
         figures = result.summary()
         spread = "" if result.alike else f" ± {figures['return_std']:.2f}"
         rows.add_row(
             condition.name,
             percent_ci(figures["success_rate"], figures["success_ci95"]),
+            "–" if free in (None, result) else points(cost(free, result)),
             f"{figures['return_mean']:.2f}{spread}",
             f"{figures['steps_mean']:.1f}",
             f"{100 * figures['crashed_fraction']:.1f} %",
         )
     console.print(rows)
+    if free is not None and len(results) > 1:
+        console.print(COST, soft_wrap=True)
     if any(result.alike for _, result in results):
         console.print(ALIKE, soft_wrap=True)
 
@@ -117,10 +139,22 @@ def as_json(results: list[tuple[Condition, Evaluation]]) -> list[dict[str, Any]]
             "name": condition.name,
             "crash": condition.crash.model_dump(mode="json"),
             **result.summary(),
+            **_cost_json(results, condition, result),
             "per_episode": [asdict(episode) for episode in result.episodes],
         }
         for condition, result in results
     ]
+
+
+def _cost_json(
+    results: list[tuple[Condition, Evaluation]], condition: Condition, result: Evaluation
+) -> dict[str, Any]:
+    """``cost`` and its interval, of a condition with crashes beside a crash-free one."""
+    free = next((each for other, each in results if other.crashed == 0), None)
+    if free is None or condition.crashed == 0:
+        return {}
+    found = cost(free, result)
+    return {"cost": found.value, "cost_ci95": [found.low, found.high]}
 
 
 def evaluate(
@@ -139,6 +173,7 @@ def evaluate(
     victims: Annotated[
         list[str] | None, typer.Option(help="ROBOT ...: all of these robots, in every episode.")
     ] = None,
+    each_robot: EachRobotOption = False,
     mode: ModeOption = "stay",
     param: ParamOption = None,
     processes: ProcessesOption = 1,
@@ -151,15 +186,16 @@ def evaluate(
 ) -> None:
     """Tells how a team does under crashes, or crash-free without a crash option.
 
-    Trained teams act greedily. Every rate, every number and the victims together are a row each.
+    Trained teams act greedily. Every rate, every number and the victims together are a row each;
+    beside them stands what the crashes cost, against the same episodes without crashes.
     """
     check_json_target(json)
     parameters = mode_parameters(mode, param or [])
     target = load_target(team, scenario)
     name = target.scenario
-    asked = conditions(
-        target.robots, crash_rate or [], crashed or [], victims or [], mode, parameters
-    )
+    who = crash_rate or [], crashed or [], victims or []
+    asked = conditions(target.robots, *who, mode, parameters)
+    asked = with_each_robot(asked, target.robots, each_robot, mode, parameters)
     played = play(target, asked, episodes, seed, processes, via, layout)
     results = list(zip(asked, played, strict=True))
     show(f"{team} on {name}: {episodes} episodes each, seed {seed}, via {via}", results)
