@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -79,10 +80,50 @@ def show(results: Results, episodes: int) -> None:
         console.print(ALIKE, soft_wrap=True)
 
 
-def summary(results: Results, out: Path, seed: int) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Finding:
+    """What the demo found. ``holds``: the coached team coped with everything."""
+
+    holds: bool
+    text: str
+
+
+def judge(results: Results, steps: int, out: Path) -> Finding:
+    """In one sentence, what the crashes cost each team; where the coached team failed, what to do.
+
+    steps: of each training.
+    """
+    failed = {
+        method: [condition.name for condition, found in evaluations if found.success_rate < 1]
+        for method, evaluations in results.items()
+    }
+    if failed["adaptive"]:
+        longer = out.with_name(out.name + "_longer")
+        return Finding(
+            False,
+            f"The coached team FAILED: {'; '.join(failed['adaptive'])}. {steps:,} steps did not "
+            "teach it everything; train for twice as long with\n"
+            f"    crash-coach demo --out {longer} --set total_steps={2 * steps}\n"
+            "or with another seed: --train-seed 1 and another --out.",
+        )
+    crashes = [name for name in failed["qmix"] if name != crash_free().name]
+    coped = "The team trained with crashes copes with each of them"
+    if not crashes:
+        return Finding(True, f"{coped}; so, this time, does the plain team, with the same learner.")
+    alike = "" if crash_free().name in failed["qmix"] else " is as good until a robot crashes, but"
+    return Finding(
+        True,
+        f"{coped}; the plain team, with the same learner and the same {steps:,} steps,{alike} "
+        f"fails with {' and with '.join(crashes)}.",
+    )
+
+
+def summary(results: Results, found: Finding, out: Path, seed: int) -> dict[str, Any]:
     return {
         "scenario": "buttons",
         "seed": seed,
+        "coached_team_copes": found.holds,
+        "finding": found.text,
         "methods": {
             method: {"checkpoint": str(out / method), "conditions": as_json(evaluations)}
             for method, evaluations in results.items()
@@ -94,7 +135,9 @@ def demo(
     out: Annotated[Path, typer.Option(help="Folder for runs, figures, pictures.")] = Path(
         "runs/demo"
     ),
-    episodes: Annotated[int, typer.Option(help="Episodes per team and crash.", min=1)] = 8,
+    episodes: Annotated[
+        int, typer.Option(help="Episodes per team and crash; here all are the same.", min=1)
+    ] = 1,
     seed: Annotated[int, typer.Option(help="Seed of the evaluation.", min=0)] = 0,
     train_seed: Annotated[int | None, typer.Option(help="Seed of the trainings.")] = None,
     layout: Annotated[Layout, typer.Option(help="How the ROS graph is spread.")] = Layout.nodes,
@@ -102,7 +145,10 @@ def demo(
         list[str] | None, typer.Option("--set", help="key=value ...: replaces training settings.")
     ] = None,
 ) -> None:
-    """Trains a plain and a coached team on `buttons`, crashes each robot, shows what it costs."""
+    """Trains a plain and a coached team on `buttons`, crashes each robot, shows what it costs.
+
+    Exit code 1 where the coached team fails in any of it.
+    """
     out.mkdir(parents=True, exist_ok=True)
     train_teams(out, override or [], train_seed)
     results = run_graphs(out, episodes, seed, layout)
@@ -119,7 +165,9 @@ def demo(
         load_policy(out / "qmix").scenario,
         picture,
     )
-    write_json(out / "summary.json", summary(results, out, seed))
+    bundle = load_policy(out / "adaptive")
+    found = judge(results, int(bundle.meta["config"]["total_steps"]), out)
+    write_json(out / "summary.json", summary(results, found, out, seed))
     console.print("Everything lies here:")
     for what, where in (
         ("team trained plainly", out / "qmix"),
@@ -128,3 +176,7 @@ def demo(
         ("trajectories", picture),
     ):
         console.print(f"  {what:<21}{where}", soft_wrap=True)
+    console.print()
+    console.print(found.text, style="green" if found.holds else "bold red", soft_wrap=True)
+    if not found.holds:
+        raise typer.Exit(1)
