@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from crash_coach_bringup.cli.demo import Results, crash_conditions, judge
-from policy_pkg.train.evaluate import EpisodeResult, Evaluation
+from crash_coach_bringup.cli.verbs.demo import Results, crash_conditions, judge
+from policy_pkg.play.evaluate import EpisodeResult, Evaluation
 
 ROBOTS = ("robot_1", "robot_2")
 
@@ -17,7 +17,7 @@ def results(plain: str, coached: str) -> Results:
     found: Results = {}
     for method, letters in (("qmix", plain), ("adaptive", coached)):
         for condition, letter in zip(crash_conditions(ROBOTS), letters, strict=True):
-            one = EpisodeResult(0, letter == "y", 0.0, 5, (), "")
+            one = EpisodeResult(0, letter == "y", 0.0, 5, (), "", "")
             evaluation = Evaluation(condition.name, ROBOTS, 0, (one,))
             found.setdefault(method, []).append((condition, evaluation))
     return found
