@@ -25,7 +25,7 @@ from policy_pkg.learner.replay import Replay
 from policy_pkg.play.rollout import Rollout
 from policy_pkg.policy import RecurrentPolicy
 from policy_pkg.train.config import TrainConfig
-from policy_pkg.train.session import Session
+from policy_pkg.train.session import TrainSession
 from sim_pkg.env import make_env
 from sim_pkg.scenario_files import find_scenario
 
@@ -74,14 +74,14 @@ def training_rate(scenario: str, calls: int) -> float:
     config = TrainConfig.model_validate(
         {"scenario": scenario, "n_envs": 8, "updates_per_episode": 0.125, "replay_episodes": 500}
     )
-    session = Session(config, make_env(scenario, 8), make_env(scenario, 1))
+    session = TrainSession(config, make_env(scenario, 8), make_env(scenario, 1))
 
     def work() -> None:
         for _ in range(calls):
-            session.collect()
+            session.advance()
 
     while session.learner.updates < 3:
-        session.collect()
+        session.advance()
     return steps_per_cpu_s(work, 8 * calls)
 
 

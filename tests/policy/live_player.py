@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -142,30 +141,36 @@ class Player:
 
 
 class InProcess:
-    """A lock-step order and its graphs; episodes arrive in an order of ``shuffle``'s choice."""
+    """A lock-step run and its graphs; episodes arrive in an order of ``shuffle``'s choice."""
 
     def __init__(self, config: TrainConfig, shuffle: int | None = None) -> None:
-        self.session = LiveSession(config, SPEC)
-        self.order = Lockstep(self.session, self.end_block)
+        self.waiting: list[Task] = []
+        self.session = LiveSession(config, SPEC, Lockstep, self.take)
         self.players = [Player(config, graph) for graph in range(config.n_envs)]
         self.lines: list[dict[str, Value]] = []
         self.tasks: list[Task] = []
         self.shuffle = None if shuffle is None else random.Random(shuffle)
 
-    def end_block(self, block: Sequence[RecordedEpisode]) -> None:
-        line = self.session.end_block(block)
+    def take(self, tasks: list[Task]) -> None:
+        self.waiting += tasks
+        self.tasks += tasks
+
+    def end_block(self) -> None:
+        line = self.session.end_block()
         self.lines.append(line)
         for player in self.players:
             player.coach.record_block(float(line["success_rate"] or 0), Progress(0, 0, 0))
 
     def go(self, lose: frozenset[int] = frozenset()) -> None:
         """To the end; the episodes of the tasks in ``lose`` are lost."""
-        waiting = self.order.begin()
-        while waiting:
-            self.tasks += waiting
-            done = [(task, self.players[task.graph].play(task)) for task in waiting]
+        while not self.session.finished:
+            tasks, self.waiting = self.waiting, []
+            done = [(task, self.players[task.graph].play(task)) for task in tasks]
             if self.shuffle is not None:
                 self.shuffle.shuffle(done)
-            waiting = []
             for task, recorded in done:
-                waiting += self.order.played(task, None if task.number in lose else recorded)
+                self.session.played(task, None if task.number in lose else recorded)
+            for _ in done or [None]:
+                self.session.advance()
+            if self.session.block_due:
+                self.end_block()

@@ -11,13 +11,14 @@ from small_run import small
 
 from policy_pkg.checkpoint import BEST, list_checkpoints, load_policy, read_manifest
 from policy_pkg.play.evaluate import EpisodeResult, Evaluation
+from policy_pkg.train.blocks import Block
 from policy_pkg.train.run import train
-from policy_pkg.train.session import Block
 
 
 def played(successes: int, crashed: tuple[int, ...] = (), episodes: int = 10) -> Evaluation:
     results = tuple(
-        EpisodeResult(number, number < successes, 0.0, 1, crashed, "") for number in range(episodes)
+        EpisodeResult(number, number < successes, 0.0, 1, crashed, "", "")
+        for number in range(episodes)
     )
     return Evaluation("", ("a", "b"), 0, results)
 

@@ -101,8 +101,8 @@ def test_a_lost_episode_is_left_out_and_a_lost_test_played_again() -> None:
 
 def test_real_time_shares_a_block_among_the_graphs_and_ends_it_without_what_was_lost() -> None:
     config = small(n_envs=2, test_episodes=3)
-    session, lines = LiveSession(config, SPEC), []
-    order = RealTime(session, lambda block: lines.append((len(block), session.end_block(block))))
+    session = LiveSession(config, SPEC)
+    order = RealTime(session)
     players = [Player(config, graph) for graph in range(2)]
     tests = order.begin()
     assert [(t.graph, t.episodes, t.test, t.epsilon) for t in tests] == [
@@ -111,8 +111,10 @@ def test_real_time_shares_a_block_among_the_graphs_and_ends_it_without_what_was_
     ]
     assert order.played(tests[0], players[0].play(tests[0])) == []
     assert order.played(tests[1], None) == []
-    after = order.played(tests[0], players[0].play(tests[0]))
-    assert [length for length, _ in lines] == [2]
+    assert order.played(tests[0], players[0].play(tests[0])) == []
+    assert len(order.block) == 2
+    session.counters.close(0, config.test_interval_steps, config.total_steps)
+    after = order.begin()
     assert [(t.graph, t.episodes, t.test) for t in after] == [(0, 0, False), (1, 0, False)]
     newest = order.played(after[1], players[1].play(after[1]))
     assert [t.graph for t in newest] == [0, 1]
@@ -122,10 +124,11 @@ def test_real_time_shares_a_block_among_the_graphs_and_ends_it_without_what_was_
 
 def test_an_episode_of_another_team_is_refused() -> None:
     run = InProcess(small())
-    task = run.order.begin()[0]
-    recorded = run.players[0].play(task)
+    run.session.advance()
+    recorded = run.players[0].play(run.tasks[0])
+    run.session.played(run.tasks[0], replace(recorded, robots=("robot_1", "robot_9")))
     with pytest.raises(UserError, match="an episode of"):
-        run.order.played(task, replace(recorded, robots=("robot_1", "robot_9")))
+        run.session.advance()
     cut = replace(recorded.episode, obs=recorded.episode.obs[..., :1])
     with pytest.raises(UserError, match=r"does not fit scenario 'buttons': episode\.obs"):
         run.session.learn(replace(recorded, episode=cut))
@@ -158,7 +161,7 @@ def live(
 
     def on_tasks(tasks: list[Task]) -> None:
         for task in tasks:
-            run.played(task, player.play(task))
+            run.session.played(task, player.play(task))
 
     run = LiveRun(config, SPEC, out, resume, "lockstep", on_tasks, on_block, print)
     with run:
@@ -203,7 +206,7 @@ def test_divergence_is_told_and_its_batch_kept(tmp_path: Path) -> None:
             recorded = player.play(task)
             if not task.test:
                 recorded.episode.reward[0] = np.inf
-            run.played(task, recorded)
+            run.session.played(task, recorded)
 
     run = LiveRun(config, SPEC, out, False, "lockstep", on_tasks, lambda *_: None, print)
     player = Player(config)

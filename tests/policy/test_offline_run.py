@@ -27,9 +27,9 @@ from policy_pkg.statistics import binomial_weights
 from policy_pkg.train.offline import run as offline
 from policy_pkg.train.offline.config import OfflineConfig
 from policy_pkg.train.offline.data import load_data
-from policy_pkg.train.offline.run import OfflineReport, OfflineSummary, read_data
+from policy_pkg.train.offline.run import read_data
 from policy_pkg.train.offline.session import MEANS, OfflineSession
-from policy_pkg.train.run import TrainError
+from policy_pkg.train.run import ProgressReport, RunSummary, TrainError
 from policy_pkg.train.run_dir import RunError
 
 SMALL: dict[str, Any] = {
@@ -71,7 +71,7 @@ def recordings() -> list[Recording]:
 
 def train_offline(
     config: OfflineConfig, recordings: list[Recording], run: Path, **rest: Any
-) -> OfflineSummary:
+) -> RunSummary:
     return offline.train_offline(config, read_data(config, recordings), run, **rest)
 
 
@@ -81,7 +81,7 @@ def lines(run: Path) -> list[dict[str, Any]]:
 
 def test_a_run_writes_what_it_promises(tmp_path: Path, recordings: list[Recording]) -> None:
     config, run = small(learner=CONSERVATIVE, tensorboard=True), tmp_path / "runs" / "x"
-    reports: list[OfflineReport] = []
+    reports: list[ProgressReport] = []
     summary = train_offline(config, recordings, run, progress=reports.append, sources=["bags/one"])
     blocks = lines(run)
     assert [line["gradient_steps"] for line in blocks] == [0, 10, 20, 30, 40, 50]
@@ -113,7 +113,7 @@ def test_a_run_writes_what_it_promises(tmp_path: Path, recordings: list[Recordin
     assert summary.checkpoint == run / "checkpoints" / "step_000000050"
     assert (summary.episodes, summary.gradient_steps) == (40, 50)
     assert summary.last_block == blocks[-1]
-    assert (reports[-1].phase, reports[-1].gradient_steps) == ("finished", 50)
+    assert (reports[-1].phase, reports[-1].steps) == ("finished", 50)
 
 
 @pytest.mark.parametrize("method", ["plain", "cloning"])
@@ -132,7 +132,7 @@ def test_weight_0_is_plain_q_learning_on_the_same_batches(
     learner = Learner(session.config.learner, session.data.sizes, seed=0)
     draws = OfflineSession(session.config, session.data, None).sampling
     for step in range(30):
-        session.step()
+        session.advance()
         slots = draws.choice(40, size=8, replace=False, shuffle=False)
         learner.update(session.data.episodes.gather(slots), episodes=step + 1)
     mine, theirs = session.learner.state_dict()[0], learner.state_dict()[0]
@@ -166,8 +166,8 @@ def test_stopping_anywhere_and_resuming_changes_no_bit(
     train_offline(config, recordings, whole)
     for phase, steps in (("evaluation", 10), ("checkpoint", 40), ("training", 47)):
 
-        def stop(report: OfflineReport, phase: str = phase, steps: int = steps) -> None:
-            if report.phase == phase and report.gradient_steps >= steps:
+        def stop(report: ProgressReport, phase: str = phase, steps: int = steps) -> None:
+            if report.phase == phase and report.steps >= steps:
                 raise Stopped
 
         run, ticks = tmp_path / f"{phase}-{steps}", iter(range(10**9))
@@ -205,7 +205,7 @@ def test_crash_weights_are_logged_and_what_is_missing_is_told(
     tmp_path: Path, recordings: list[Recording]
 ) -> None:
     crashed = [one for one in recordings if one.episode.faults.any(0).sum() < 2]
-    reports: list[OfflineReport] = []
+    reports: list[ProgressReport] = []
     config = METHODS["cloning"].model_copy(update={"crash_rate": 0.5})
     run = tmp_path / "x"
     train_offline(config, [*crashed, crashed[0]], run, progress=reports.append)

@@ -85,7 +85,7 @@ def test_stopping_anywhere_and_resuming_changes_no_bit(
     whole: Path, tmp_path: Path, phase: Phase, steps: int
 ) -> None:
     def stop(report: ProgressReport) -> None:
-        if report.phase == phase and report.env_steps >= steps:
+        if report.phase == phase and report.steps >= steps:
             raise Stopped
 
     run = tmp_path / "run"
@@ -111,7 +111,7 @@ def test_faults_with_memory_go_on_where_they_were(tmp_path: Path) -> None:
     train(config, tmp_path / "whole")
 
     def stop(report: ProgressReport) -> None:
-        if report.env_steps >= 600:
+        if report.steps >= 600:
             raise Stopped
 
     ticks = iter(range(10**9))
@@ -191,7 +191,7 @@ def test_resuming_a_finished_run_changes_nothing(whole: Path) -> None:
     before = {p: p.stat().st_mtime_ns for p in whole.rglob("*") if p.is_file()}
     reports: list[ProgressReport] = []
     summary = train(CONFIG, whole, resume=True, progress=reports.append)
-    assert summary.env_steps == 2400
+    assert summary.steps == 2400
     assert [r.phase for r in reports] == ["finished"]
     after = {p: p.stat().st_mtime_ns for p in whole.rglob("*") if p.is_file()}
     assert set(before) == set(after)

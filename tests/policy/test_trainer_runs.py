@@ -20,7 +20,7 @@ from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.metrics import __doc__ as METRICS_DOC
 from policy_pkg.train.run import ProgressReport, TrainError, train
 from policy_pkg.train.run_dir import RunError, locked, prepare_run
-from policy_pkg.train.session import Session
+from policy_pkg.train.session import TrainSession
 from sim_pkg.env import Env, make_env
 
 
@@ -59,7 +59,7 @@ def test_a_run_writes_what_it_promises(tmp_path: Path) -> None:
     assert summary.checkpoint == run / "checkpoints" / "step_000001200"
     assert summary.last_block == blocks[-1]
     last = reports[-1]
-    assert (last.phase, last.env_steps, last.eta_s) == ("finished", 1200, 0.0)
+    assert (last.phase, last.steps, last.eta_s) == ("finished", 1200, 0.0)
     assert last.alpha == pytest.approx(1 - 0.8**5)
 
 
@@ -75,9 +75,9 @@ def test_the_same_config_gives_the_same_metrics_and_another_seed_does_not(tmp_pa
 def test_gradient_steps_follow_the_finished_episodes(per_episode: float) -> None:
     """Credit is given per finished episode from the first full batch on, as PyMARL trains."""
     config = small(updates_per_episode=per_episode)
-    session = Session(config, make_env("buttons", 4), make_env("buttons", 4))
+    session = TrainSession(config, make_env("buttons", 4), make_env("buttons", 4))
     for _ in range(150):
-        session.collect()
+        session.advance()
         credited = max(0, session.counters.episodes - config.batch_episodes + 1)
         assert session.learner.updates == int(credited * per_episode)
     assert session.counters.env_steps == 600
@@ -85,12 +85,12 @@ def test_gradient_steps_follow_the_finished_episodes(per_episode: float) -> None
 
 
 def test_the_acting_policy_is_the_learners() -> None:
-    session = Session(small(), make_env("buttons", 4), make_env("buttons", 4))
+    session = TrainSession(small(), make_env("buttons", 4), make_env("buttons", 4))
     obs, index = np.ones((2, session.env.spec.obs_size), np.float32), np.arange(2, dtype=np.int32)
     hidden = session.policy.initial_hidden(2)
     before, _ = session.policy.forward(obs, index, index, hidden)
     while session.learner.updates < 3:
-        session.collect()
+        session.advance()
     acting, _ = session.policy.forward(obs, index, index, hidden)
     session.policy.set_weights(session.learner.agent_weights())
     learners, _ = session.policy.forward(obs, index, index, hidden)
@@ -172,7 +172,7 @@ def test_a_full_disk_at_checkpoint_time_loses_nothing(tmp_path: Path) -> None:
     kept: list[list[str]] = []
 
     def meddle(report: ProgressReport) -> None:
-        if report.phase == "checkpoint" and report.env_steps == 600 and not report.warning:
+        if report.phase == "checkpoint" and report.steps == 600 and not report.warning:
             disk.__enter__()
         elif report.warning:
             disk.__exit__(None, None, None)
@@ -191,7 +191,7 @@ def test_a_disk_full_at_the_end_says_how_to_get_the_result(tmp_path: Path) -> No
     disk = full_disk()
 
     def fill(report: ProgressReport) -> None:
-        if report.phase == "checkpoint" and report.env_steps == 1200:
+        if report.phase == "checkpoint" and report.steps == 1200:
             disk.__enter__()
 
     try:
@@ -199,7 +199,7 @@ def test_a_disk_full_at_the_end_says_how_to_get_the_result(tmp_path: Path) -> No
             train(small(), tmp_path / "x", progress=fill)
     finally:
         disk.__exit__(None, None, None)
-    assert train(small(), tmp_path / "x", resume=True).env_steps == 1200
+    assert train(small(), tmp_path / "x", resume=True).steps == 1200
 
 
 def test_directories_that_cannot_be_used_are_named(tmp_path: Path) -> None:

@@ -44,10 +44,10 @@ class _Told:
             return
         self._last_s = now_s
         progress = RunProgress(
-            env_steps=report.env_steps,
+            env_steps=report.steps,
             total_steps=report.total_steps,
             steps_per_s=report.steps_per_s,
-            alpha=report.alpha,
+            alpha=report.alpha or 0.0,
             success_rate=report.success_rate,
             warning=self._warning,
         )

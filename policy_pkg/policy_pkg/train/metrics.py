@@ -1,4 +1,4 @@
-"""The files a run's figures go to: JSON lines that a resumed run continues without a seam.
+"""The files a run's figures go to, which a resumed run continues without a seam.
 
 ``metrics.jsonl`` has one line per evaluation block. Nothing in it depends on the clock, so the
 same config and seed give the same file, byte for byte. A value that does not exist is null.
@@ -46,9 +46,15 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from crash_coach_common.contract import UserError
+from policy_pkg.train.run_dir import METRICS, TENSORBOARD, TIMING
+
+if TYPE_CHECKING:
+    from policy_pkg.train.tensorboard import TensorBoard
 
 Value = str | int | float | None
 
@@ -136,3 +142,80 @@ class Means:
     def load_state_dict(self, state: dict[str, dict[str, float]]) -> None:
         self._sums = dict(state["sums"])
         self._counts = {name: int(count) for name, count in state["counts"].items()}
+
+
+@dataclass(frozen=True)
+class Logged:
+    """What the run's log files held when the checkpoint was written."""
+
+    metrics_bytes: int = 0
+    timing_bytes: int = 0
+    last_block: dict[str, Value] | None = None
+
+
+class RunLog:
+    """``metrics.jsonl``, ``timing.jsonl`` and, where asked for, TensorBoard's events.
+
+    Args:
+        out_dir: the run directory.
+        logged: what the checkpoint knows of these files; what lies behind is cut off.
+        clock_s, step: the clock and the steps done at the start.
+        step_key: what steps are called in ``timing.jsonl``.
+        tensorboard: whether to write events.
+    """
+
+    def __init__(
+        self,
+        out_dir: Path,
+        logged: Logged,
+        clock_s: float,
+        step: int,
+        step_key: str,
+        tensorboard: bool,
+    ) -> None:
+        self._metrics = JsonLines(out_dir / METRICS, logged.metrics_bytes)
+        self._timing = JsonLines(out_dir / TIMING, logged.timing_bytes)
+        self._board = _board(out_dir / TENSORBOARD, step) if tensorboard else None
+        self._started_s = self._block_s = clock_s
+        self._block_step = step
+        self._step_key = step_key
+        self.last_block: dict[str, Value] = logged.last_block or {}
+
+    def write(self, line: dict[str, Value], clock_s: float, step: int) -> None:
+        """Adds a block's line.
+
+        Raises:
+            OSError: it could not be written; the lines go out with the next one.
+        """
+        spent_s = clock_s - self._block_s
+        speed = (step - self._block_step) / spent_s if spent_s > 0 else None
+        self._block_s, self._block_step = clock_s, step
+        self.last_block = line
+        self._metrics.append(line)
+        wall_s = clock_s - self._started_s
+        self._timing.append({self._step_key: step, "wall_s": wall_s, "steps_per_s": speed})
+        self._metrics.flush()
+        self._timing.flush()
+        if self._board is not None:
+            self._board.write(line, step)
+
+    def sync(self) -> Logged:
+        """Waits until everything is on the disk; returns what a checkpoint has to know.
+
+        Raises:
+            OSError: it could not be written.
+        """
+        return Logged(self._metrics.sync(), self._timing.sync(), self.last_block)
+
+    def close(self) -> None:
+        self._metrics.close()
+        self._timing.close()
+        if self._board is not None:
+            self._board.close()
+
+
+def _board(folder: Path, purge_step: int) -> TensorBoard:
+    # Imported here: who only reads metrics need not wait for it.
+    from policy_pkg.train.tensorboard import TensorBoard
+
+    return TensorBoard(folder, purge_step)

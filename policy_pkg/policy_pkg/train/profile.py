@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from crash_coach_common.contract import UserError
+from policy_pkg.train.blocks import Block
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.run import Clock, ProgressReport, train
-from policy_pkg.train.session import Block, Session
+from policy_pkg.train.session import TrainSession
 from sim_pkg.env import Env
 
 REST = "rest"
@@ -151,7 +152,7 @@ class _Meter:
         self.stopwatch = Stopwatch(self.clock, self.cpu_clock)
         self._opened_s = self.clock()
 
-    def open(self, session: Session) -> None:
+    def open(self, session: TrainSession) -> None:
         self._session = session
         env = session.env
         assert isinstance(env, Env)  # as ``train`` makes it
@@ -170,7 +171,7 @@ class _Meter:
         self._watch_blocks(session)
         self._watch_loop(session)
 
-    def _watch_blocks(self, session: Session) -> None:
+    def _watch_blocks(self, session: TrainSession) -> None:
         inner = session.test
 
         def test() -> Block:
@@ -182,15 +183,15 @@ class _Meter:
         session.test = test  # type: ignore[method-assign]
         self.stopwatch.watch(session, "test", EVALUATION)
 
-    def _watch_loop(self, session: Session) -> None:
-        inner = session.collect
+    def _watch_loop(self, session: TrainSession) -> None:
+        inner = session.advance
 
-        def collect() -> None:
+        def advance() -> None:
             self.stopwatch.switch(REST)  # a checkpoint ends here
             self._look()
             inner()
 
-        session.collect = collect  # type: ignore[method-assign]
+        session.advance = advance  # type: ignore[method-assign]
 
     def _look(self) -> None:
         now_s = self.clock()
@@ -214,7 +215,7 @@ class _Meter:
             self.stopwatch.switch(CHECKPOINT)
         waiting = self.started_s is None
         doing = "waiting for the first gradient step" if waiting else "measuring"
-        self.tell(f"{report.env_steps:,} steps, {doing}")
+        self.tell(f"{report.steps:,} steps, {doing}")
 
     def profile(self) -> Profile:
         """Of what was measured until now."""

@@ -1,27 +1,32 @@
-"""One training run: its loop, its files, its reports; and continuing one that was killed."""
+"""One training run: its loop, its files, its reports; and continuing one that was killed.
+
+There is one loop. What is learned from differs, and with it the session: episodes that are played
+in this process, episodes that graphs play, recordings.
+"""
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from types import TracebackType
+from typing import Any, ClassVar, Literal, Protocol, Self
 
-import torch
 from safetensors import SafetensorError
 from safetensors.numpy import save_file
 
 from crash_coach_common.contract import BatchEnv, UserError
 from policy_pkg.checkpoint import CHECKPOINTS, list_checkpoints
 from policy_pkg.learner.learner import DivergedError
+from policy_pkg.learner.threads import use_one_thread
 from policy_pkg.train.config import TrainConfig
-from policy_pkg.train.metrics import Value
-from policy_pkg.train.run_dir import locked, prepare_run
-from policy_pkg.train.run_log import RunLog
-from policy_pkg.train.session import TEST_ARENAS, Session
-from policy_pkg.train.snapshot import Logged, restore, save, save_best
+from policy_pkg.train.metrics import Logged, RunLog, Value
+from policy_pkg.train.run_dir import RunConfig, locked, prepare_run
+from policy_pkg.train.session import TEST_ARENAS, TrainSession
+from policy_pkg.train.snapshot import Saved, restore, save, save_best
 from sim_pkg.env import make_env
 
 Phase = Literal["training", "evaluation", "checkpoint", "finished"]
@@ -32,24 +37,78 @@ REPORT_INTERVAL_S = 0.2
 SPEED_WINDOW_S = 10.0
 
 
+class EndedEarly(Exception):
+    """A run was asked to end before its last step; resuming it goes on from its checkpoint."""
+
+
 class TrainError(UserError):
     """Training stopped: it diverged, or its result could not be written."""
+
+
+class Session(Saved, Protocol):
+    """All of a run that changes while it runs; knows nothing of files.
+
+    ``STEPS``: what its steps are called in ``metrics.jsonl``. ``alpha``, ``epsilon``: the nominal
+    crash rate and the exploration now; None where the session decides neither.
+    """
+
+    STEPS: ClassVar[str]
+
+    @property
+    def config(self) -> RunConfig: ...
+    @property
+    def total_steps(self) -> int: ...
+    @property
+    def episodes(self) -> int: ...
+    @property
+    def alpha(self) -> float | None: ...
+    @property
+    def epsilon(self) -> float | None: ...
+
+    @property
+    def block_due(self) -> bool:
+        """Whether ``end_block`` is to be called now: at step 0, at intervals and at the end."""
+        ...
+
+    @property
+    def finished(self) -> bool:
+        """All steps are done, and the block behind them."""
+        ...
+
+    @property
+    def best_is_now(self) -> bool:
+        """Whether the last block was the best so far, and worth keeping the policy for."""
+        ...
+
+    def advance(self) -> None:
+        """A little of the way, in bounded time.
+
+        Raises:
+            DivergedError: from the learner.
+        """
+        ...
+
+    def end_block(self) -> dict[str, Value]:
+        """Tests the policy; the block's line of metrics."""
+        ...
 
 
 @dataclass(frozen=True)
 class ProgressReport:
     """Where a run stands; from the first step on, the callback gets one a few times per second.
 
+    steps, total_steps: environment steps, or gradient steps of a run on recordings.
+    alpha, epsilon: None where the session decides neither.
     success_rate, success_crash_free: of the last evaluation block; None where not measured.
     steps_per_s, eta_s: from the last seconds; 0 for a finished run that was resumed.
-    warning: something that went wrong and was survived; reported once.
+    warning: something that the user should know, or that was survived; reported once.
     """
 
     phase: Phase
-    env_steps: int
+    steps: int
     total_steps: int
-    alpha: float
-    epsilon: float
+    alpha: float | None
+    epsilon: float | None
     success_rate: float | None
     success_crash_free: float | None
     steps_per_s: float
@@ -58,29 +117,37 @@ class ProgressReport:
 
 
 @dataclass(frozen=True)
-class TrainSummary:
+class RunSummary:
     """A finished run. wall_s: of this process, 0 where the run was finished already."""
 
     out_dir: Path
     checkpoint: Path
-    env_steps: int
+    steps: int
     episodes: int
     gradient_steps: int
-    alpha: float
     wall_s: float
     last_block: dict[str, Value]
+
+
+OnProgress = Callable[[ProgressReport], None]
+
+
+def silent(report: ProgressReport) -> None: ...
+
+
+def _untold(line: Mapping[str, Value]) -> None: ...
 
 
 def train(
     config: TrainConfig,
     out_dir: Path,
     resume: bool = False,
-    progress: Callable[[ProgressReport], None] = lambda report: None,
+    progress: OnProgress = silent,
     clock: Clock = time.perf_counter,
     environment: MakeEnv = make_env,
-    opened: Callable[[Session], None] = lambda session: None,
-) -> TrainSummary:
-    """Trains until ``config.total_steps``.
+    opened: Callable[[TrainSession], None] = lambda session: None,
+) -> RunSummary:
+    """Trains until ``config.total_steps`` on episodes that are played in this process.
 
     Args:
         out_dir: becomes the run's directory; missing or empty, unless ``resume`` is set.
@@ -94,72 +161,104 @@ def train(
         UserError: the config does not fit the scenario, ``out_dir`` cannot be used, a checkpoint
             is damaged, training diverged, or the result could not be written.
     """
-    torch.set_num_threads(1)  # a second core is better used by a second run
     env = environment(config.scenario, config.n_envs)
     test_env = environment(config.scenario, min(TEST_ARENAS, config.test_episodes))
-    session = Session(config, env, test_env)
-    prepare_run(out_dir, config, resume)
-    with locked(out_dir):
-        trainer = _Trainer(session, out_dir, progress, clock)
-        try:
-            opened(session)
-            return trainer.run()
-        finally:
-            trainer.close()
+    session = TrainSession(config, env, test_env)
+    with Run(session, out_dir, resume, progress, clock) as run:
+        opened(session)
+        return run.go()
 
 
-class _Trainer:
-    """Steps a session and keeps its files."""
+class Run:
+    """Steps a session and keeps its files; a context manager.
+
+    Args:
+        data: describes the data set of a run on recordings.
+        warnings: what the user should know before the first step.
+        on_block: told a block's line once it is written, before what follows.
+        stopped: asked between steps whether to end early, as the last checkpoint leaves it.
+
+    Raises:
+        UserError: on entering: ``out_dir`` cannot be used, or a checkpoint is damaged.
+    """
 
     def __init__(
         self,
         session: Session,
         out_dir: Path,
-        progress: Callable[[ProgressReport], None],
-        clock: Clock,
+        resume: bool,
+        progress: OnProgress = silent,
+        clock: Clock = time.perf_counter,
+        data: dict[str, Any] | None = None,
+        warnings: Sequence[str] = (),
+        on_block: Callable[[dict[str, Value]], None] = _untold,
+        stopped: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._session = session
-        self._out_dir = out_dir
-        self._progress = progress
-        self._clock = clock
-        found = list_checkpoints(out_dir / CHECKPOINTS)
-        self._checkpoint = found[-1] if found else None
-        logged = restore(found[-1], session) if found else Logged()
-        self._saved_steps = steps = session.counters.env_steps
-        self._started_s = self._reported_s = clock()
-        board = session.config.tensorboard and not session.finished
-        self._log = RunLog(out_dir, logged, self._started_s, steps, "env_steps", board)
-        self._marks = deque([(self._started_s, steps)])
-        self._warning: str | None = None
+        self._session, self._out_dir, self._resume, self._data = session, out_dir, resume, data
+        self._progress, self._clock = progress, clock
+        self._on_block, self._stopped = on_block, stopped
+        self._warnings = deque(warnings)
+        self._held = ExitStack()
 
-    def run(self) -> TrainSummary:
+    def __enter__(self) -> Self:
+        use_one_thread()
+        session, out_dir = self._session, self._out_dir
+        prepare_run(out_dir, session.config, self._resume, self._data)
+        with ExitStack() as held:
+            held.enter_context(locked(out_dir))
+            found = list_checkpoints(out_dir / CHECKPOINTS)
+            self._checkpoint = found[-1] if found else None
+            logged = restore(found[-1], session) if found else Logged()
+            self._saved_steps = steps = session.steps
+            self._started_s = self._reported_s = self._clock()
+            self._marks = deque([(self._started_s, steps)])
+            board = session.config.tensorboard and not session.finished
+            self._log = RunLog(out_dir, logged, self._started_s, steps, session.STEPS, board)
+            held.callback(self._log.close)
+            self._held = held.pop_all()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._held.close()
+
+    def go(self) -> RunSummary:
+        """To the end: however the last step came about, a block and a checkpoint lie behind it.
+
+        Raises:
+            TrainError: it diverged, or the result could not be written.
+            EndedEarly: ``stopped`` said so.
+        """
         session = self._session
+        while self._warnings:
+            self._report("training")
         while True:
-            # A checkpoint lies behind its block, so a finished run that is resumed has none due.
-            if session.block_due and self._block_is_new():
+            if session.block_due:
                 self._block()
             if session.finished:
                 break
-            self._collect()
+            if self._stopped():
+                raise EndedEarly
+            self._advance()
         self._report("finished")
         return self._summary()
 
-    def _block_is_new(self) -> bool:
-        return self._log.last_block.get("env_steps") != self._session.counters.env_steps
-
-    def _collect(self) -> None:
+    def _advance(self) -> None:
         try:
-            self._session.collect()
+            self._session.advance()
         except DivergedError as error:
-            steps = self._session.counters.env_steps
-            raise TrainError(keep_batch(self._out_dir, steps, error)) from error
+            raise TrainError(keep_batch(self._out_dir, self._session.steps, error)) from error
         if self._clock() - self._reported_s >= REPORT_INTERVAL_S:
             self._report("training")
 
     def _block(self) -> None:
         session = self._session
         self._report("evaluation")
-        line, steps = session.end_block(session.test()), session.counters.env_steps
+        line, steps = session.end_block(), session.steps
         try:
             self._log.write(line, self._clock(), steps)
         except OSError as error:
@@ -169,16 +268,17 @@ class _Trainer:
         due = steps - self._saved_steps
         if due and (due >= session.config.checkpoint_interval_steps or session.finished):
             self._save()
+        self._on_block(line)
 
     def _save_best(self) -> None:
         try:
             save_best(self._out_dir, self._session)
         except OSError as error:
-            problem = f"the best checkpoint, at {self._session.counters.env_steps} steps,"
+            problem = f"the best checkpoint, at {self._session.steps} steps,"
             self._report("evaluation", f"{problem} was not written: {error}")
 
     def _save(self) -> None:
-        session, steps = self._session, self._session.counters.env_steps
+        session, steps = self._session, self._session.steps
         self._report("checkpoint")
         try:
             self._checkpoint = save(self._out_dir, session, self._log.sync())
@@ -194,48 +294,44 @@ class _Trainer:
     def _report(self, phase: Phase, warning: str | None = None) -> None:
         session, now = self._session, self._clock()
         self._reported_s = now
-        self._warning = warning or self._warning
-        steps, total = session.counters.env_steps, session.config.total_steps
+        if warning is not None:
+            self._warnings.append(warning)
+        steps, total = session.steps, session.total_steps
         self._marks.append((now, steps))
         while now - self._marks[0][0] > SPEED_WINDOW_S and len(self._marks) > 2:
             self._marks.popleft()
         since_s, since_steps = self._marks[0]
         moving = now > since_s and steps > since_steps
-        if not moving and not session.finished:
+        if not moving and not session.finished and not self._warnings:
             return
         speed = (steps - since_steps) / (now - since_s) if moving else 0.0
         report = ProgressReport(
             phase=phase,
-            env_steps=steps,
+            steps=steps,
             total_steps=total,
-            alpha=session.coach.rate,
-            epsilon=session.config.epsilon(steps),
+            alpha=session.alpha,
+            epsilon=session.epsilon,
             success_rate=_number(self._log.last_block.get("success_rate")),
             success_crash_free=_number(self._log.last_block.get("success_crash_free")),
             steps_per_s=speed,
             eta_s=max(0, total - steps) / speed if moving else 0.0,
-            warning=self._warning,
+            warning=self._warnings.popleft() if self._warnings else None,
         )
-        self._warning = None
         self._progress(report)
 
-    def _summary(self) -> TrainSummary:
-        session, done = self._session, self._session.counters
+    def _summary(self) -> RunSummary:
+        session = self._session
         if self._checkpoint is None:
             raise RuntimeError("a finished run has no checkpoint")
-        return TrainSummary(
+        return RunSummary(
             out_dir=self._out_dir,
             checkpoint=self._checkpoint,
-            env_steps=done.env_steps,
-            episodes=done.episodes,
+            steps=session.steps,
+            episodes=session.episodes,
             gradient_steps=session.learner.updates,
-            alpha=session.coach.rate,
             wall_s=self._clock() - self._started_s,
             last_block=self._log.last_block,
         )
-
-    def close(self) -> None:
-        self._log.close()
 
 
 def keep_batch(out_dir: Path, steps: int, error: DivergedError) -> str:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from torch.utils.tensorboard import SummaryWriter
+from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
 from policy_pkg.train.metrics import Value
 
@@ -13,17 +17,23 @@ from policy_pkg.train.metrics import Value
 class TensorBoard:
     """Writes every number of a metrics line under its key.
 
-    purge_step: events from this environment step on, of a killed run, are hidden.
+    purge_step: events from this step on, of a killed run, are hidden.
     """
 
     def __init__(self, folder: Path, purge_step: int) -> None:
-        self._writer = SummaryWriter(str(folder), purge_step=purge_step)
+        self._writer = EventFileWriter(str(folder))
+        start = SessionLog(status=SessionLog.START)
+        self._writer.add_event(self._event(purge_step, session_log=start))
 
-    def write(self, line: Mapping[str, Value], env_steps: int) -> None:
+    def _event(self, step: int, **content: Any) -> Event:
+        return Event(wall_time=time.time(), step=step, **content)
+
+    def write(self, line: Mapping[str, Value], step: int) -> None:
         """Raises OSError where events could not be written."""
         for key, value in line.items():
             if isinstance(value, int | float) and key != "env_steps":
-                self._writer.add_scalar(key, value, env_steps)
+                scalar = Summary.Value(tag=key, simple_value=value)
+                self._writer.add_event(self._event(step, summary=Summary(value=[scalar])))
         self._writer.flush()
 
     def close(self) -> None:

@@ -49,7 +49,7 @@ class Trainer:
         with self._run, ThreadPoolExecutor(len(self._graphs)) as threads:
             for graph in self._graphs:
                 link = LockstepLink if graph.lockstep else RealTimeLink
-                self._links.append(link(graph, self._run.played, self._stop.is_set))
+                self._links.append(link(graph, self._run.session.played, self._stop.is_set))
             serving = [threads.submit(link.serve) for link in self._links]
             try:
                 self._run.start()

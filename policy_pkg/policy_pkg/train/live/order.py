@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 from policy_pkg.bags.dataset import RecordedEpisode
-from policy_pkg.train.live.session import LiveSession
+from policy_pkg.train.config import TrainConfig
 
 LAG = 1
 """Rounds of episodes that are under way while those before them are learned from."""
 
-EndBlock = Callable[[Sequence[RecordedEpisode]], None]
+
+class Learns(Protocol):
+    """What an order needs of a session."""
+
+    @property
+    def config(self) -> TrainConfig: ...
+    @property
+    def epsilon(self) -> float: ...
+    @property
+    def agent(self) -> bytes: ...
+    @property
+    def finished(self) -> bool: ...
+    @property
+    def tests_next(self) -> bool: ...
+    def saw(self, graph: int, recorded: RecordedEpisode) -> None: ...
+    def learn(self, recorded: RecordedEpisode) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -31,7 +45,12 @@ class Task:
 
 
 class Order(Protocol):
-    """Turns episodes into tasks; ``end_block`` is called with the episodes of a whole block."""
+    """Turns episodes into tasks. ``block``: the episodes of a block, once it is whole, until they
+    are taken; then it begins anew."""
+
+    block: list[RecordedEpisode]
+
+    def __init__(self, session: Learns) -> None: ...
 
     def begin(self) -> list[Task]:
         """The first tasks; none where nothing is left to do."""
@@ -50,11 +69,12 @@ class Lockstep:
     been learned from, and ends before the next one starts.
     """
 
-    def __init__(self, session: LiveSession, end_block: EndBlock) -> None:
-        self._session, self._end_block = session, end_block
+    def __init__(self, session: Learns) -> None:
+        self._session = session
         self._issued = self._done = 0
         self._arrived: dict[int, tuple[Task, RecordedEpisode | None]] = {}
-        self._block: list[RecordedEpisode] = []
+        self._testing: list[RecordedEpisode] = []
+        self.block: list[RecordedEpisode] = []
         self._turn = 0
 
     def begin(self) -> list[Task]:
@@ -62,7 +82,7 @@ class Lockstep:
         if session.finished:
             return []
         self._turn = 0
-        if session.block_due:
+        if session.tests_next:
             return [self._issue(test=True) for _ in range(config.test_episodes)]
         return [self._issue(test=False) for _ in range(config.n_envs * (1 + LAG))]
 
@@ -90,36 +110,35 @@ class Lockstep:
             return self._take_test(recorded)
         if recorded is not None:
             self._session.learn(recorded)
-        if self._session.block_due:
+        if self._session.tests_next:
             return self.begin() if self._issued == self._done else []
         return [self._issue(test=False)]
 
     def _take_test(self, recorded: RecordedEpisode | None) -> list[Task]:
         if recorded is None:
             return [self._issue(test=True)]  # another one in its place
-        self._block.append(recorded)
-        if self._issued > self._done:
-            return []
-        block, self._block = self._block, []
-        self._end_block(block)
-        return self.begin()
+        self._testing.append(recorded)
+        if self._issued == self._done:
+            self.block, self._testing = self._testing, []
+        return []
 
 
 class RealTime:
     """The newest weights for graphs that go on by themselves."""
 
-    def __init__(self, session: LiveSession, end_block: EndBlock) -> None:
-        self._session, self._end_block = session, end_block
+    def __init__(self, session: Learns) -> None:
+        self._session = session
         self._issued = 0
-        self._block: list[RecordedEpisode] = []
+        self._tested: list[RecordedEpisode] = []
         self._testing = 0  # episodes of the block that are still to come
+        self.block: list[RecordedEpisode] = []
 
     def begin(self) -> list[Task]:
         session = self._session
         if session.finished:
             return []
         graphs = range(session.config.n_envs)
-        if not session.block_due:
+        if not session.tests_next:
             return [self._issue(graph, test=False, episodes=0) for graph in graphs]
         self._testing = count = session.config.test_episodes
         shares = [count // len(graphs) + (graph < count % len(graphs)) for graph in graphs]
@@ -149,10 +168,8 @@ class RealTime:
     def _take_test(self, recorded: RecordedEpisode | None) -> list[Task]:
         self._testing -= 1
         if recorded is not None:
-            self._block.append(recorded)
+            self._tested.append(recorded)
         if self._testing:
             return []
-        block, self._block = self._block, []
-        if block:
-            self._end_block(block)
-        return self.begin()
+        self.block, self._tested = self._tested, []
+        return [] if self.block else self.begin()  # all were lost: once more

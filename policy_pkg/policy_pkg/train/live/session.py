@@ -1,9 +1,11 @@
-"""All of a live training run that changes while it runs; knows nothing of ROS, files and clocks."""
+"""What changes while a run learns from the episodes that graphs play; knows nothing of ROS."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import queue
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, ClassVar
 
 import numpy as np
 from safetensors.numpy import save as to_bytes
@@ -11,49 +13,55 @@ from safetensors.numpy import save as to_bytes
 from crash_coach_common.contract import EnvSpec, UserError
 from crash_coach_pkg.coach.coach import BlockRecord
 from policy_pkg.bags.dataset import RecordedEpisode
-from policy_pkg.episode import Sizes
-from policy_pkg.learner.learner import Learner
-from policy_pkg.learner.replay import Replay
 from policy_pkg.play.evaluate import EpisodeResult, Evaluation
+from policy_pkg.train.blocks import Block
 from policy_pkg.train.config import TrainConfig
-from policy_pkg.train.metrics import Means, Value
-from policy_pkg.train.session import (
-    LEARNER_MEANS,
-    SAMPLING,
-    TRAIN_MEANS,
-    Block,
-    Counters,
-    block_line,
-    generator,
-)
+from policy_pkg.train.live.order import Lockstep, Order, Task
+from policy_pkg.train.metrics import Value
+from policy_pkg.train.session import EpisodeSession
 from sim_pkg.trajectory import CourseHash
 
+POLL_S = 0.1  # how soon a run notices that it is to end
+QUEUE_EPISODES = 10_000  # in real time a learner that is too slow falls behind by so many at most
 
-class LiveSession:
+
+class LiveSession(EpisodeSession):
     """Learns from the episodes that graphs play.
 
     Args:
         config: of the run; ``n_envs`` graphs.
         spec: of the team.
+        order: which episodes are played when, and learned from in which order.
+        on_tasks: told what the graphs are to play next, by the thread that calls ``advance``.
     """
 
-    def __init__(self, config: TrainConfig, spec: EnvSpec) -> None:
-        self.config, self.spec = config, spec
+    VERB: ClassVar[str] = "train-live"
+    alpha = None  # the coach is a node
+    best_is_now = False
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        spec: EnvSpec,
+        order: type[Order] = Lockstep,
+        on_tasks: Callable[[list[Task]], None] = lambda tasks: None,
+    ) -> None:
         for key, off in (("explore_hold", 1), ("test_victim_episodes", 0)):
             if (value := getattr(config, key)) != off:
                 raise UserError(
                     f"{key} {value}: must be {off} in live training, whose policy nodes explore "
                     "step by step and whose blocks the coach's node plans"
                 )
-        sizes = Sizes.of(spec)
-        self.learner = Learner(config.learner, sizes, config.seed)
-        self.replay = Replay(config.replay_episodes, sizes, config.replay_strata)
-        self.sampling = generator(config.seed, SAMPLING)
-        self.counters, self.means = Counters(), Means()
+        super().__init__(config, spec)
         self.next_episodes = [0] * config.n_envs
         """The number behind the last episode seen of each graph."""
         self._planned = [0, 0]  # training robots since the last block: crashing, all
         self._agent = (-1, b"")
+        self._order, self._on_tasks = order(self), on_tasks
+        self._begun = False
+        self._episodes: queue.Queue[tuple[Task, RecordedEpisode | None]] = queue.Queue(
+            QUEUE_EPISODES
+        )
 
     @property
     def agent(self) -> bytes:
@@ -64,18 +72,46 @@ class LiveSession:
         return self._agent[1]
 
     @property
-    def epsilon(self) -> float:
-        return self.config.epsilon(self.counters.env_steps)
+    def tests_next(self) -> bool:
+        """Whether the graphs are to play a block's episodes."""
+        return self.counters.due(self.steps)
 
     @property
     def block_due(self) -> bool:
-        return self.counters.block_due(self.config.total_steps)
+        """Whether they have played it."""
+        return bool(self._order.block)
 
     @property
-    def finished(self) -> bool:
-        """All steps are done, and the block behind them."""
-        done = self.counters
-        return done.next_block_steps > done.env_steps >= self.config.total_steps
+    def episodes_waiting(self) -> int:
+        """Episodes that ``advance`` has not come to yet."""
+        return self._episodes.qsize()
+
+    def played(self, task: Task, recorded: RecordedEpisode | None) -> None:
+        """An episode of ``task``; None: it was lost. From any thread; returns at once.
+
+        Raises:
+            UserError: the learner is hopelessly behind.
+        """
+        try:
+            self._episodes.put_nowait((task, recorded))
+        except queue.Full:
+            raise UserError(
+                f"{QUEUE_EPISODES} episodes wait for the learner: it cannot keep up; take fewer "
+                "graphs or fewer updates_per_episode"
+            ) from None
+
+    def advance(self) -> None:
+        """Takes the next episode, or comes back after ``POLL_S`` without one.
+
+        Raises:
+            DivergedError: from the learner.
+            UserError: it is of another team, or does not fit the scenario.
+        """
+        if not self._begun:
+            self._begun = True
+            self._on_tasks(self._order.begin())
+        with suppress(queue.Empty):
+            self._on_tasks(self._order.played(*self._episodes.get(timeout=POLL_S)))
 
     def saw(self, graph: int, recorded: RecordedEpisode) -> None:
         """Call with every episode of a graph.
@@ -94,38 +130,25 @@ class LiveSession:
             DivergedError: from the learner.
             UserError: it does not fit the scenario.
         """
-        done, config, episode = self.counters, self.config, recorded.episode
+        done, episode = self.counters, recorded.episode
         try:
-            self.replay.add(episode, recorded.success)
+            self._keep(episode, recorded.success)
         except ValueError as error:
             raise UserError(
-                f"episode {recorded.number} does not fit scenario {config.scenario!r}: {error}"
+                f"episode {recorded.number} does not fit scenario {self.config.scenario!r}: {error}"
             ) from error
         done.env_steps += episode.length
-        done.episodes += 1
         self._planned[0] += len(_victims(recorded))
         self._planned[1] += len(recorded.robots)
-        figures = (
-            float(recorded.success),
-            float(episode.reward.sum(dtype=np.float64)),
-            float(episode.length),
-        )
-        self.means.add(dict(zip(TRAIN_MEANS, figures, strict=True)))
-        if len(self.replay) < config.batch_episodes:
-            return
-        done.credit += config.updates_per_episode
-        while done.credit >= 1:
-            done.credit -= 1
-            batch = self.replay.sample(self.sampling, config.batch_episodes)
-            self.means.add(self.learner.update(batch, episodes=done.episodes))
+        self._learn()
 
-    def end_block(self, played: Sequence[RecordedEpisode]) -> dict[str, Value]:
-        """The metrics of a block of greedy episodes.
+    def end_block(self) -> dict[str, Value]:
+        """The metrics of the greedy episodes that the graphs have played.
 
         The coach decides elsewhere, after this: ``decision`` and ``new_alpha`` are null, and the
         next line's ``alpha`` tells. Without crashes the block is the crash-free one as well.
         """
-        config, robots = self.config, self.spec.robots
+        config, robots, played = self.config, self.spec.robots, self._order.block
         evaluation = Evaluation("block", robots, config.seed, tuple(map(_result, played)))
         crashed = any(result.crashed for result in evaluation.episodes)
         block = Block(evaluation, None if crashed or not config.test_crash_free else evaluation)
@@ -142,43 +165,23 @@ class LiveSession:
             new_rate=rate,
         )
         self._planned = [0, 0]
-        self.counters.close_block(config.test_interval_steps)
-        means = self.means.take(TRAIN_MEANS + LEARNER_MEANS)
-        updates, reports = self.learner.updates, self.spec.reports_success
-        line = block_line(config, self.counters, updates, record, block, means, reports)
-        return {**line, "decision": None, "new_alpha": None}
+        self._order.block, self._begun = [], False
+        return {**self._close(record, block), "decision": None, "new_alpha": None}
 
     def state_dict(self) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
-        """Tensor files by stem, and JSON values."""
-        learner, learner_values = self.learner.state_dict()
-        tensors = {"agent": self.learner.agent_weights(), "learner": learner}
-        if self.config.checkpoint_replay:
-            tensors["replay"] = self.replay.state_dict()
-        values = {
-            "learner": learner_values,
-            "sampling": dict(self.sampling.bit_generator.state),
-            "means": self.means.state_dict(),
-            "next_episodes": list(self.next_episodes),
-            "planned": list(self._planned),
-        }
-        return tensors, values
+        tensors, values = super().state_dict()
+        more = {"next_episodes": list(self.next_episodes), "planned": list(self._planned)}
+        return tensors, {**values, **more}
 
     def load_state_dict(
-        self, tensors: dict[str, dict[str, Any]], values: dict[str, Any], counters: Counters
+        self,
+        tensors: dict[str, dict[str, Any]],
+        values: dict[str, Any],
+        counts: dict[str, Any],
     ) -> None:
-        """Continues from what ``state_dict`` gave; only for a session not yet used.
-
-        Raises:
-            ValueError, KeyError: it is of something else, or incomplete.
-        """
-        self.learner.load_state_dict(tensors["learner"], values["learner"])
-        if self.config.checkpoint_replay:
-            self.replay.load_state_dict(tensors["replay"])
-        self.sampling.bit_generator.state = values["sampling"]
-        self.means.load_state_dict(values["means"])
+        super().load_state_dict(tensors, values, counts)
         self.next_episodes = [int(number) for number in values["next_episodes"]]
         self._planned = [int(count) for count in values["planned"]]
-        self.counters = counters
 
 
 def _victims(recorded: RecordedEpisode) -> set[int]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -15,14 +15,15 @@ from policy_pkg.learner.replay import Batch
 from policy_pkg.play.conditions import Condition, crash_free, exactly
 from policy_pkg.play.evaluate import evaluate_in
 from policy_pkg.policy import RecurrentPolicy
+from policy_pkg.train.blocks import Schedule
 from policy_pkg.train.metrics import Means, Value
 from policy_pkg.train.offline.config import OfflineConfig
 from policy_pkg.train.offline.crash_weights import CrashWeights, crash_weights
 from policy_pkg.train.offline.data import FixedData
-from policy_pkg.train.session import generator
+from policy_pkg.train.session import SAMPLING, TEST_KEY, generator
+from policy_pkg.train.snapshot import Team
 
-_TEST_KEY = 0x7E57
-_SAMPLING = 2  # stream of the run's seed
+UNKNOWN_SCENARIO = "unknown"
 MEANS = (
     "loss",
     "grad_norm",
@@ -54,14 +55,19 @@ class OfflineSession:
         UserError: the config does not fit the recordings or the scenario.
     """
 
+    VERB: ClassVar[str] = "train-offline"
+    STEPS: ClassVar[str] = "gradient_steps"
+    alpha = epsilon = None
+    best_is_now = False
+    stems = ("learner",)
+
     def __init__(self, config: OfflineConfig, data: FixedData, test_env: BatchEnv | None) -> None:
         self.config, self.data, self._test_env = config, data, test_env
-        self.blocks, self.next_block_steps = 0, 0
-        self.means = Means()
+        self.schedule, self.means = Schedule(), Means()
         sizes = data.sizes
         self._check(sizes.n_robots)
         self.weights = self._crash_weights()
-        self.sampling = generator(config.seed, _SAMPLING)
+        self.sampling = generator(config.seed, SAMPLING)
         self.learner: Learner | Cloner
         if config.method == "q_learning":
             self.learner = Learner(config.learner, sizes, config.seed)
@@ -99,19 +105,31 @@ class OfflineSession:
         return (_Test("crash_free", crash_free()), *crashed)
 
     @property
-    def gradient_steps(self) -> int:
+    def team(self) -> Team:
+        sizes, scenario = self.data.sizes, self.config.scenario or UNKNOWN_SCENARIO
+        return Team(scenario, self.data.robots, sizes.n_actions, sizes.obs_size)
+
+    @property
+    def steps(self) -> int:
         return self.learner.updates
 
     @property
+    def total_steps(self) -> int:
+        return self.config.gradient_steps
+
+    @property
+    def episodes(self) -> int:
+        return len(self.data)
+
+    @property
     def finished(self) -> bool:
-        return self.gradient_steps >= self.config.gradient_steps
+        return self.schedule.finished(self.steps, self.total_steps)
 
     @property
     def block_due(self) -> bool:
-        """At step 0, whenever a multiple of the interval is reached, and at the end."""
-        return self.gradient_steps >= min(self.next_block_steps, self.config.gradient_steps)
+        return self.schedule.due(self.steps)
 
-    def step(self) -> None:
+    def advance(self) -> None:
         """One gradient step.
 
         Raises:
@@ -135,19 +153,19 @@ class OfflineSession:
         if isinstance(self.learner, Cloner):
             return self.learner.update(batch, weights=weights)
         # The target copies are counted in episodes; here a gradient step counts as one.
-        return self.learner.update(batch, episodes=self.gradient_steps + 1, weights=weights)
+        return self.learner.update(batch, episodes=self.steps + 1, weights=weights)
 
-    def test(self) -> dict[str, Value]:
+    def _test(self) -> dict[str, Value]:
         """Plays the block's episodes greedily under each condition; each block has its own."""
         self.policy.set_weights(self.learner.agent_weights())
         count, env = self.config.test_episodes, self._test_env
-        episodes = range(self.blocks * count, (self.blocks + 1) * count)
+        episodes = range(self.schedule.blocks * count, (self.schedule.blocks + 1) * count)
         figures: dict[str, Value] = {}
         for test in self._tests:
             success: float | None = None
             mean_return: float | None = None
             if env is not None:
-                seed = self.config.seed ^ _TEST_KEY
+                seed = self.config.seed ^ TEST_KEY
                 played = evaluate_in(env, self.policy, test.condition, episodes, seed)
                 success = played.success_rate if env.spec.reports_success else None
                 mean_return = played.return_mean
@@ -155,24 +173,19 @@ class OfflineSession:
             figures[f"return_{test.label}"] = mean_return
         return figures
 
-    def end_block(self, figures: dict[str, Value]) -> dict[str, Value]:
-        """The block's line of metrics."""
-        interval, steps = self.config.test_interval_steps, self.gradient_steps
-        self.blocks += 1
-        self.next_block_steps = (steps // interval + 1) * interval
+    def end_block(self) -> dict[str, Value]:
+        """Tests the policy; the block's line of metrics."""
+        figures, steps, config = self._test(), self.steps, self.config
+        self.schedule.close(steps, config.test_interval_steps, config.gradient_steps)
         return {
             "gradient_steps": steps,
-            "epochs": steps * self.config.batch_episodes / len(self.data),
+            "epochs": steps * config.batch_episodes / len(self.data),
             **figures,
             **self.means.take(MEANS),
         }
 
-    def progress(self) -> dict[str, int | float]:
-        return {
-            "gradient_steps": self.gradient_steps,
-            "blocks": self.blocks,
-            "next_block_steps": self.next_block_steps,
-        }
+    def counts(self) -> dict[str, int | float]:
+        return {"gradient_steps": self.steps, **asdict(self.schedule)}
 
     def state_dict(self) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
         """Tensor files by stem, and JSON values."""
@@ -185,15 +198,19 @@ class OfflineSession:
         return {"agent": self.learner.agent_weights(), "learner": learner}, values
 
     def load_state_dict(
-        self, learner: dict[str, Any], values: dict[str, Any], progress: dict[str, int | float]
+        self,
+        tensors: dict[str, dict[str, Any]],
+        values: dict[str, Any],
+        counts: dict[str, Any],
     ) -> None:
-        """Continues from what ``state_dict`` and ``progress`` gave.
+        """Continues from what ``state_dict`` and ``counts`` gave.
 
         Raises:
-            ValueError, KeyError: it is of something else, or incomplete.
+            ValueError, KeyError, TypeError: it is of something else, or incomplete.
         """
-        self.learner.load_state_dict(learner, values["learner"])
+        self.learner.load_state_dict(tensors["learner"], values["learner"])
         self.sampling.bit_generator.state = values["sampling"]
         self.means.load_state_dict(values["means"])
-        self.blocks = int(progress["blocks"])
-        self.next_block_steps = int(progress["next_block_steps"])
+        blocks = {key: int(counts[key]) for key in ("blocks", "next_block_steps")}
+        self.schedule = Schedule(**blocks)
+        self.schedule.bound(self.steps, self.total_steps)

@@ -118,7 +118,7 @@ class _Runner:
             report = message.content
             if report.warning:
                 console.print(f"[yellow]{self.jobs[message.job].name}: {report.warning}[/yellow]")
-            self.bars.update(task, completed=report.env_steps / report.total_steps)
+            self.bars.update(task, completed=report.steps / report.total_steps)
             self.bars.update(task, figures=_figures(report))
             return
         if message.kind == "done":

@@ -15,7 +15,7 @@ from policy_pkg.bags.problems import Problem
 from policy_pkg.train.offline.config import OfflineConfig, load_offline_config
 
 if TYPE_CHECKING:
-    from policy_pkg.train.offline.run import OfflineReport
+    from policy_pkg.train.run import ProgressReport
 
 
 def _tell(problem: Problem) -> None:
@@ -23,18 +23,18 @@ def _tell(problem: Problem) -> None:
 
 
 class _Bar:
-    """Shows OfflineReports in a progress bar."""
+    """Shows ProgressReports in a progress bar."""
 
     def __init__(self, bars: Progress, task: TaskID) -> None:
         self._bars, self._task = bars, task
 
-    def show(self, report: OfflineReport) -> None:
+    def show(self, report: ProgressReport) -> None:
         if report.warning:
             console.print(f"[yellow]{report.warning}[/yellow]", soft_wrap=True)
         figures = f"{report.steps_per_s:,.0f} gradient steps/s"
         if report.success_crash_free is not None:
             figures = f"success {report.success_crash_free:.2f}  {figures}"
-        done = report.gradient_steps / report.total_steps
+        done = report.steps / report.total_steps
         self._bars.update(self._task, completed=done, figures=figures)
 
 
