@@ -27,7 +27,8 @@ class Stream:
     """A relay, and everything that came out of it."""
 
     def __init__(self) -> None:
-        self.relay = Relay(N, DT_S, OPAQUE, lambda command: OpaqueTools(), START_S)
+        self.relay = Relay(N, DT_S, START_S)
+        self.relay.know(OPAQUE, lambda command: OpaqueTools())
         self.outputs: Outputs = []
         self.revision = 0
 

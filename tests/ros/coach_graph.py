@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -52,11 +52,18 @@ def arguments(**parameters: object) -> list[str]:
 
 @contextmanager
 def process(
-    env: dict[str, str], name: str, package: str = "crash_coach_pkg", **parameters: object
+    env: dict[str, str],
+    name: str,
+    package: str = "crash_coach_pkg",
+    rules: Sequence[str] = (),
+    **parameters: object,
 ) -> Iterator[subprocess.Popen[str]]:
-    """An executable in a session of its own, gone when the block is left."""
+    """An executable in a session of its own, gone when the block is left.
+
+    ``rules``: remapping, ``from:=to``.
+    """
     child = subprocess.Popen(
-        [executable(name, package), *arguments(**parameters)],
+        [executable(name, package), *arguments(**parameters), *remapped(rules)],
         env=env,
         text=True,
         stderr=subprocess.PIPE,
@@ -70,10 +77,16 @@ def process(
         child.communicate(timeout=WAIT_S)
 
 
-def run_to_end(env: dict[str, str], name: str, **parameters: object) -> tuple[int, str]:
+def remapped(rules: Sequence[str]) -> list[str]:
+    return [word for rule in rules for word in ("-r", rule)]
+
+
+def run_to_end(
+    env: dict[str, str], name: str, rules: Sequence[str] = (), **parameters: object
+) -> tuple[int, str]:
     """Exit code and stderr of an executable that ends by itself."""
     done = subprocess.run(
-        [executable(name), *arguments(**parameters)],
+        [executable(name), *arguments(**parameters), *remapped(rules)],
         env=env,
         text=True,
         stderr=subprocess.PIPE,

@@ -32,13 +32,21 @@ class Sent(NamedTuple):
 Outputs = list[Sent | Event]
 
 
-def refusal(plan: CrashPlan, offers: frozenset[Need]) -> str:
-    """Why a relay whose commands offer no more than ``offers`` cannot carry out ``plan``; or ''."""
+def refusal(plan: CrashPlan, offers: frozenset[Need] | None) -> str:
+    """Why a relay whose commands offer no more than ``offers`` cannot carry out ``plan``; or ''.
+
+    ``offers`` None: the type of the commands is not known yet.
+    """
     if plan.episode != EPISODE:
         return (
             f"the plan is for episode {plan.episode}, but this gate knows no episodes: all is "
             f"episode {EPISODE} (start the coach with follow_sim:=false)"
         )
+    if offers is None:
+        unknown = (
+            "the type of the commands is not known yet: nobody publishes any (command_type auto)"
+        )
+        return unknown if plan.faults else ""
     if reason := why_not(plan, offers, observations=True):
         return reason
     for fault in plan.faults:
@@ -56,24 +64,18 @@ class Relay:
     """Decides about a team's commands.
 
     Args:
-        offers: what the tools of this type of command can do.
-        tools: for the step in which that command is the newest.
         now_s: of a steady clock, when step 0 begins; so are all other times.
+
+    Until ``know`` is called no plan with faults is accepted.
     """
 
-    def __init__(
-        self,
-        n_robots: int,
-        dt_s: float,
-        offers: frozenset[Need],
-        tools: Callable[[bytes], Tools[bytes]],
-        now_s: float,
-    ) -> None:
+    def __init__(self, n_robots: int, dt_s: float, now_s: float) -> None:
         self._n = n_robots
         self._dt_s = dt_s
-        self._tools = tools
+        self._offers: frozenset[Need] | None = None
+        self._tools: Callable[[bytes], Tools[bytes]] | None = None
         self._start_s = now_s
-        self.book = PlanBook(False, 0.0, lambda plan: refusal(plan, offers))
+        self.book = PlanBook(False, 0.0, lambda plan: refusal(plan, self._offers))
         """The plans; read only."""
         self.book.enter(EPISODE)
         self._step = 0
@@ -84,6 +86,11 @@ class Relay:
         self._running: list[Change] = []
         self._decided_in = [-1] * n_robots  # under a fault
         self._waiting: list[bytes | None] = [None] * n_robots  # for the next tick
+
+    def know(self, offers: frozenset[Need], tools: Callable[[bytes], Tools[bytes]]) -> None:
+        """The type of the commands: what its tools can do, and the tools for the step in which
+        that command is the newest."""
+        self._offers, self._tools = offers, tools
 
     def decided(self) -> list[Decided]:
         """Of each robot, now."""
@@ -180,6 +187,7 @@ class Relay:
         return self._decide(self._team, robot, data)
 
     def _decide(self, team: TeamFaults[bytes], robot: int, data: bytes) -> Outputs:
+        assert self._tools is not None  # a plan with faults was accepted
         self._decided_in[robot] = self._step
         return self._told(robot, team.command(robot, data, self._tools(data)))
 

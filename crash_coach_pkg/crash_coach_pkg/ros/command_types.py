@@ -100,6 +100,7 @@ class TwistTools(OpaqueTools):
 class CommandType:
     """A message type, and what faults can do with its commands."""
 
+    name: str
     message: type
     offers: frozenset[Need]
     tools: Callable[[bytes], OpaqueTools]
@@ -115,8 +116,11 @@ def command_type(name: str, limits: Limits) -> CommandType:
     message = _message_type(name)
     twist_of = {Twist: _itself, TwistStamped: _within}.get(message)
     if twist_of is None:
-        return CommandType(message, frozenset(("availability",)), lambda command: OpaqueTools())
+        return CommandType(
+            name, message, frozenset(("availability",)), lambda command: OpaqueTools()
+        )
     return CommandType(
+        name,
         message,
         frozenset(("availability", "sampler", "vector")),
         lambda command: TwistTools(message, twist_of, limits, command),
@@ -136,7 +140,7 @@ def _message_type(name: str) -> type:
     if len(parts) != 3 or parts[1] != "msg" or not all(part.isidentifier() for part in parts):
         raise UserError(
             f"parameter command_type = {name!r}: not of the form package/msg/Type, such as "
-            "geometry_msgs/msg/Twist"
+            "geometry_msgs/msg/Twist; nor is it auto"
         )
     package, _, type_name = parts
     try:

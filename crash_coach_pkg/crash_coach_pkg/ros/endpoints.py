@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -28,13 +29,44 @@ class Sighting(NamedTuple):
     gone: tuple[Endpoint, ...]
 
 
+class Stranger(NamedTuple):
+    """Somebody on one of the gate's topics whose type is another than the gate's."""
+
+    node: str
+    type_name: str
+
+
+def strangers(node: Node, topic: str, type_name: str, listening: bool) -> tuple[Stranger, ...]:
+    """Who publishes on (``listening``: subscribes to) ``topic`` with another type, in order."""
+    found = (
+        node.get_subscriptions_info_by_topic(topic)
+        if listening
+        else node.get_publishers_info_by_topic(topic)
+    )
+    return tuple(
+        sorted(
+            Stranger(_full_name(info), info.topic_type)
+            for info in found
+            if info.topic_type != type_name
+        )
+    )
+
+
+def types_published(node: Node, topics: Iterable[str]) -> frozenset[str]:
+    """The types of all publishers on ``topics``."""
+    return frozenset(
+        info.topic_type for topic in topics for info in node.get_publishers_info_by_topic(topic)
+    )
+
+
+def _full_name(info: Any) -> str:
+    return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+
+
 def publishers_on(node: Node, topic: str) -> frozenset[Endpoint]:
     """Every publisher on ``topic`` that the graph knows of now."""
     return frozenset(
-        Endpoint(
-            bytes(info.endpoint_gid).hex(),
-            f"{info.node_namespace.rstrip('/')}/{info.node_name}",
-        )
+        Endpoint(bytes(info.endpoint_gid).hex(), _full_name(info))
         for info in node.get_publishers_info_by_topic(topic)
     )
 
@@ -47,6 +79,7 @@ class WatchedPublisher:
 
     def __init__(self, node: Node, type_: type, topic: str, qos: QoSProfile) -> None:
         self._node = node
+        self._name = topic  # remapping is applied to it, not to what comes of that
         before = publishers_on(node, topic)
         self._publisher = node.create_publisher(type_, topic, qos)
         name = node.get_fully_qualified_name()
@@ -76,7 +109,7 @@ class WatchedPublisher:
 
     def look(self) -> Sighting:
         """Asks the graph; call at a low rate."""
-        found = publishers_on(self._node, self.topic)
+        found = publishers_on(self._node, self._name)
         now = frozenset(e for e in found if e.gid not in self._own and not self._nameless(e))
         sighting = Sighting(tuple(sorted(now - self._seen)), tuple(sorted(self._seen - now)))
         self._seen = now

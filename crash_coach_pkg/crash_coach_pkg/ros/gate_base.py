@@ -24,6 +24,7 @@ from crash_coach_pkg.plan import CrashPlan
 from crash_coach_pkg.ros.convert import message_from_event, message_from_plan, plan_from_message
 from crash_coach_pkg.ros.endpoints import WatchedPublisher
 from crash_coach_pkg.ros.robot_names import robot_names
+from crash_coach_pkg.ros.robot_topics import RobotTopics
 
 ACTION_TYPE = "crash_coach_interfaces/msg/Action"
 DIAGNOSTICS_S = 1.0
@@ -39,6 +40,11 @@ class Gate(Protocol):
 
     @property
     def book(self) -> PlanBook: ...
+
+    @property
+    def type_name(self) -> str:
+        """Of the commands, package/msg/Type; empty while it is not known yet."""
+        ...
 
     def plan(self, plan: CrashPlan, lease_s: float, now_s: float) -> None:
         """Takes a plan or its heartbeat, and sends what follows from it."""
@@ -64,7 +70,7 @@ class Gate(Protocol):
 
 
 class GateBase(Node):
-    """Parameters: robots, command_type, raw_topic, command_topic, cmd_timeout_s.
+    """Parameters: robots, command_type, cmd_timeout_s, and those of RobotTopics.
 
     What is attached declares its own, before ``serve`` refuses those that nobody declared.
 
@@ -77,19 +83,14 @@ class GateBase(Node):
         self._parameter_services = CheckedParameterService(self)
         self.robots = robot_names(self)
         self.command_type = self.text(
-            "command_type", ACTION_TYPE, "Type of the robots' commands: package/msg/Type."
+            "command_type",
+            ACTION_TYPE,
+            "Type of the robots' commands, package/msg/Type; auto: the one that is published on "
+            "the raw topics, once somebody does.",
         )
         actions = self.command_type == ACTION_TYPE
-        self.raw_topic = self.text(
-            "raw_topic",
-            "command_raw" if actions else "cmd_vel_raw",
-            "What is relayed: /<robot>/<this>.",
-        )
-        self.command_topic = self.text(
-            "command_topic",
-            "command" if actions else "cmd_vel",
-            "Where it is relayed to: /<robot>/<this>.",
-        )
+        defaults = ("command_raw", "command") if actions else ("cmd_vel_raw", "cmd_vel")
+        self.topics = RobotTopics(self, self.robots, defaults)
         cmd_timeout_s = self.number(
             "cmd_timeout_s",
             1.0,
@@ -99,10 +100,10 @@ class GateBase(Node):
         self.health = TeamHealth(len(self.robots), cmd_timeout_s)
         self._gate: Gate | None = None
         self._outputs: list[tuple[int, WatchedPublisher]] = []
-        self._events = self.create_publisher(FaultEvent, "/coach/events", EVENTS)
-        self._in_force = self.create_publisher(CrashPlanMessage, "/coach/plan_in_force", PLAN)
+        self._events = self.create_publisher(FaultEvent, "coach/events", EVENTS)
+        self._in_force = self.create_publisher(CrashPlanMessage, "coach/plan_in_force", PLAN)
         self._diagnostics = self.create_publisher(
-            DiagnosticArray, "/diagnostics", QoSProfile(depth=10)
+            DiagnosticArray, "diagnostics", QoSProfile(depth=10)
         )
 
     # --- for what is attached ---------------------------------------------------------------
@@ -136,8 +137,7 @@ class GateBase(Node):
 
     def command_publisher(self, robot: int, type_: type, qos: QoSProfile) -> WatchedPublisher:
         """Publishes what ``robot`` gets; others that do so too are reported as intruders."""
-        topic = f"/{self.robots[robot]}/{self.command_topic}"
-        publisher = WatchedPublisher(self, type_, topic, qos)
+        publisher = WatchedPublisher(self, type_, self.topics.commands[robot], qos)
         self._outputs.append((robot, publisher))
         return publisher
 
@@ -149,7 +149,7 @@ class GateBase(Node):
         """
         refuse_unknown_parameters(self)
         self._gate = gate
-        self.create_subscription(CrashPlanMessage, "/coach/plan", self._on_plan, PLAN)
+        self.create_subscription(CrashPlanMessage, "coach/plan", self._on_plan, PLAN)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(TICK_S, lambda: gate.tick(time.monotonic()), clock=steady)
         self.create_timer(DIAGNOSTICS_S, lambda: self._on_diagnostics(gate), clock=steady)
@@ -197,7 +197,13 @@ class GateBase(Node):
 
     def _status(self, gate: Gate, report: Report) -> DiagnosticStatus:
         refusal = gate.book.refusal
-        warnings = [gate.warning(report.robot), f"plan refused: {refusal}" if refusal else ""]
+        wrong, listeners = self._mismatches(gate, report.robot)
+        # Who publishes another type is there: "nobody" would be a lie.
+        warnings = [
+            wrong or gate.warning(report.robot),
+            listeners,
+            f"plan refused: {refusal}" if refusal else "",
+        ]
         warning = "; ".join(text for text in warnings if text)
         level, values = _LEVELS[report.state], dict(report.values)
         if level == DiagnosticStatus.OK and (warning or "intruders" in values):
@@ -212,6 +218,13 @@ class GateBase(Node):
             hardware_id=name,
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
+
+    def _mismatches(self, gate: Gate, robot: int) -> tuple[str, str]:
+        """Publishers and listeners of another type."""
+        topics, name = self.topics, gate.type_name
+        if not name:
+            return "", ""
+        return topics.wrong_publishers(robot, name), topics.wrong_listeners(robot, name)
 
     def _look_for_intruders(self, gate: Gate) -> None:
         decided = gate.decided()

@@ -68,24 +68,18 @@ class ActionGate:
         self._commands = [
             base.command_publisher(robot, Action, NEWEST).publish for robot in range(len(robots))
         ]
-        base.create_subscription(EpisodeState, "/sim/boundary", self._on_boundary, EPISODE)
+        base.create_subscription(EpisodeState, "sim/boundary", self._on_boundary, EPISODE)
         if not lockstep:  # there the sim waits, and says loudly what it does not get
-            base.create_subscription(
-                Clock, "/clock", self._on_clock, QoSProfile(depth=10), raw=True
-            )
+            base.create_subscription(Clock, "clock", self._on_clock, QoSProfile(depth=10), raw=True)
+        for robot, topic in enumerate(base.topics.raw):
+            on_command = partial(self._on_command, robot)
+            base.create_subscription(Action, topic, on_command, NEWEST, raw=True)
+        self._observations = base.topics.within("observation")
         self._seen = []
-        for robot, name in enumerate(robots):
-            base.create_subscription(
-                Action,
-                f"/{name}/{base.raw_topic}",
-                partial(self._on_command, robot),
-                NEWEST,
-                raw=True,
-            )
-            if self._relays:
-                self._seen.append(
-                    base.create_publisher(Observation, f"/{name}/observation_seen", NEWEST)
-                )
+        if self._relays:
+            base.topics.check("observation", "observation_seen")
+            for robot, topic in enumerate(base.topics.within("observation_seen")):
+                self._seen.append(base.create_publisher(Observation, topic, NEWEST))
                 self._watch(robot)
 
     # --- as Gate ----------------------------------------------------------------------------
@@ -93,6 +87,10 @@ class ActionGate:
     @property
     def book(self) -> PlanBook:
         return self._state.book
+
+    @property
+    def type_name(self) -> str:
+        return ACTION_TYPE
 
     def plan(self, plan: CrashPlan, lease_s: float, now_s: float) -> None:
         outputs = self._state.plan(plan, lease_s, now_s)
@@ -102,7 +100,7 @@ class ActionGate:
             if self._state.needs_world and not self._watches_world:
                 self._watches_world = True
                 self._base.create_subscription(
-                    EpisodeState, "/sim/episode", self._on_episode, EPISODE
+                    EpisodeState, "sim/episode", self._on_episode, EPISODE
                 )
         self._send(outputs)
 
@@ -142,7 +140,7 @@ class ActionGate:
         self._watched.add(robot)
         self._base.create_subscription(
             Observation,
-            f"/{self._base.robots[robot]}/observation",
+            self._observations[robot],
             partial(self._on_observation, robot),
             NEWEST,
             raw=True,

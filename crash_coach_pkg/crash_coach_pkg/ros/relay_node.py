@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
@@ -17,10 +17,11 @@ from crash_coach_pkg.gate.health import Decided
 from crash_coach_pkg.gate.plan_book import PlanBook
 from crash_coach_pkg.gate.relay_gate import Outputs, Relay, Sent
 from crash_coach_pkg.plan import CrashPlan
-from crash_coach_pkg.ros.command_types import Limits, command_type
-from crash_coach_pkg.ros.endpoints import Offer, offered
+from crash_coach_pkg.ros.command_types import CommandType, Limits, command_type
+from crash_coach_pkg.ros.endpoints import Offer, offered, types_published
 from crash_coach_pkg.ros.gate_base import GateBase
 
+AUTO = "auto"
 _MATCH = "match"
 _RELIABILITY = {
     "reliable": ReliabilityPolicy.RELIABLE,
@@ -38,6 +39,8 @@ _LOOK_S = 1.0
 class RelayGate:
     """Relays bytes; a serialized command is looked into only where a fault in force asks for it.
 
+    With ``command_type`` auto it begins once somebody publishes commands, and with their type.
+
     Parameters beside GateBase's: dt_s, limit.linear_x_m_s, limit.linear_y_m_s,
     limit.angular_z_rad_s, reliability, durability, depth.
 
@@ -47,7 +50,8 @@ class RelayGate:
 
     def __init__(self, base: GateBase) -> None:
         self._base = base
-        self._type = command_type(base.command_type, _limits(base))
+        self._limits = _limits(base)
+        self._type: CommandType | None = None
         dt_s = base.number(
             "dt_s",
             0.1,
@@ -60,7 +64,7 @@ class RelayGate:
         self._depth = _depth(base)
         n = len(base.robots)
         now_s = time.monotonic()
-        self._relay = Relay(n, dt_s, self._type.offers, self._type.tools, now_s)
+        self._relay = Relay(n, dt_s, now_s)
         base.create_timer(dt_s, self._on_step, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._commands = [0] * n
         self._relayed = [0] * n
@@ -69,14 +73,14 @@ class RelayGate:
             _RELIABILITY.get(self._reliability, _USUAL.reliability),
             _DURABILITY.get(self._durability, _USUAL.durability),
         )
-        qos = offer.request(self._depth)
-        self._publish = [
-            base.command_publisher(robot, self._type.message, qos).publish for robot in range(n)
-        ]
         self._asked: list[Offer] = [offer] * n
-        self._inputs: list[Subscription] = [self._subscribe(robot) for robot in range(n)]
+        self._publish: list[Callable[[bytes], None]] = []
+        self._inputs: list[Subscription] = []
         self._mismatched = True  # look at once
         self._looked_s = now_s
+        self._ambiguous: frozenset[str] = frozenset()
+        if base.command_type != AUTO:
+            self._begin(base.command_type)
 
     # --- as Gate ----------------------------------------------------------------------------
 
@@ -84,13 +88,17 @@ class RelayGate:
     def book(self) -> PlanBook:
         return self._relay.book
 
+    @property
+    def type_name(self) -> str:
+        return "" if self._type is None else self._type.name
+
     def plan(self, plan: CrashPlan, lease_s: float, now_s: float) -> None:
         self._send(self._relay.plan(plan, lease_s, now_s))
 
     def tick(self, now_s: float) -> None:
         if self._mismatched or now_s - self._looked_s >= _LOOK_S:
             self._mismatched, self._looked_s = False, now_s
-            self._match()
+            self._look()
         self._send(self._relay.tick(now_s))
 
     def decided(self) -> Sequence[Decided]:
@@ -100,9 +108,11 @@ class RelayGate:
         return (("commands", self._commands[robot]), ("relayed", self._relayed[robot]))
 
     def warning(self, robot: int) -> str:
-        if self._inputs[robot].get_publisher_count() > 0:
+        if self._ambiguous:
+            return f"command_type auto: several types are published: {_listed(self._ambiguous)}"
+        if self._inputs and self._inputs[robot].get_publisher_count() > 0:
             return ""
-        return f"nobody publishes on {self._inputs[robot].topic_name}"
+        return f"nobody publishes on {self._base.resolve_topic_name(self._base.topics.raw[robot])}"
 
     def close(self) -> None:
         """Nothing is open that the node does not close."""
@@ -126,12 +136,37 @@ class RelayGate:
             else:
                 self._base.send_events((output,))
 
-    # --- quality of service -----------------------------------------------------------------
+    # --- type and quality of service ----------------------------------------------------------
+
+    def _begin(self, type_name: str) -> None:
+        """Relays commands of this type. Raises UserError where it is not installed."""
+        self._type = command_type(type_name, self._limits)
+        self._relay.know(self._type.offers, self._type.tools)
+        qos = self._asked[0].request(self._depth)
+        robots = range(len(self._base.robots))
+        self._publish = [
+            self._base.command_publisher(robot, self._type.message, qos).publish for robot in robots
+        ]
+        self._inputs = [self._subscribe(robot) for robot in robots]
+
+    def _look(self) -> None:
+        """At the publishers: which type, which service they offer."""
+        if self._type is not None:
+            self._match()
+            return
+        found = types_published(self._base, self._base.topics.raw)
+        self._ambiguous = found if len(found) > 1 else frozenset()
+        if len(found) == 1:
+            (name,) = found
+            self._base.get_logger().info(f"command_type auto: {name} is published")
+            self._begin(name)
+            self._match()
 
     def _subscribe(self, robot: int) -> Subscription:
+        assert self._type is not None  # called by ``_begin``, or later
         return self._base.create_subscription(
             self._type.message,
-            f"/{self._base.robots[robot]}/{self._base.raw_topic}",
+            self._base.topics.raw[robot],
             partial(self._on_command, robot),
             self._asked[robot].request(self._depth),
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._on_mismatch),
@@ -145,7 +180,7 @@ class RelayGate:
     def _match(self) -> None:
         """Asks each robot's publishers for what all of them offer."""
         for robot, subscription in enumerate(self._inputs):
-            found = offered(self._base, subscription.topic_name)
+            found = offered(self._base, self._base.topics.raw[robot])
             if found is None:
                 continue
             wanted = Offer(
@@ -156,6 +191,10 @@ class RelayGate:
                 self._asked[robot] = wanted
                 self._base.destroy_subscription(subscription)
                 self._inputs[robot] = self._subscribe(robot)
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(sorted(names))
 
 
 def _limits(base: GateBase) -> Limits:
