@@ -27,7 +27,7 @@ from crash_coach_pkg.coach.coach import Coach
 from crash_coach_pkg.coach.config import TeamSpec
 from policy_pkg.train.config import (
     CONFIGS_DIR,
-    PAPER,
+    SWEEPS,
     Setting,
     TrainConfig,
     find_config,
@@ -143,7 +143,7 @@ class SweepRun:
 
 def sweep_names() -> tuple[str, ...]:
     """Names of the shipped sweeps, such as ``paper/table1``; sorted."""
-    return tuple(name for name in shipped_names(CONFIGS_DIR) if name.startswith(f"{PAPER}/"))
+    return tuple(name for name in shipped_names(CONFIGS_DIR) if name.split("/")[0] in SWEEPS)
 
 
 def find_sweep(source: str) -> Path:

@@ -27,7 +27,7 @@ from policy_pkg.learner.strata import Strata
 CONFIGS_DIR = Path(__file__).parent.parent / "configs"
 OFFLINE = "offline"  # its folder is that of `train-offline`
 TRAINING = "training config"
-PAPER = "paper"  # its folder is that of `sweep`
+SWEEPS = ("paper", "recipe")  # their folders are those of `sweep`
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
@@ -146,7 +146,7 @@ def config_names(offline: bool) -> tuple[str, ...]:
     folders = [(name, name.split("/")[0]) for name in shipped_names(CONFIGS_DIR)]
     if offline:
         return tuple(name for name, folder in folders if folder == OFFLINE)
-    return tuple(name for name, folder in folders if folder not in (OFFLINE, PAPER))
+    return tuple(name for name, folder in folders if folder not in (OFFLINE, *SWEEPS))
 
 
 def train_config_names() -> tuple[str, ...]:
