@@ -132,7 +132,7 @@ def test_an_unknown_size_or_sweep_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("size", ["full", "small"])
-@pytest.mark.parametrize("name", sweep_names())
+@pytest.mark.parametrize("name", [name for name in sweep_names() if name.startswith("paper/")])
 def test_the_papers_sweeps_can_be_read(name: str, size: str) -> None:
     runs = load_sweep(find_sweep(name), size)
     seeds = {run.config.seed for run in runs}
@@ -140,8 +140,29 @@ def test_the_papers_sweeps_can_be_read(name: str, size: str) -> None:
     assert {run.config.total_steps for run in runs} == {2_000_000} or size == "small"
 
 
+@pytest.mark.parametrize(
+    ("name", "size", "methods", "seeds"),
+    [
+        ("robust", "full", 1, 20),
+        ("share", "full", 3, 20),
+        ("ablation", "full", 5, 10),
+        ("combat", "full", 4, 5),
+        ("combat", "3s_vs_5z", 4, 3),
+    ],
+)
+def test_the_recipes_sweeps_give_every_method_the_same_learner(
+    name: str, size: str, methods: int, seeds: int
+) -> None:
+    runs = load_sweep(find_sweep(f"recipe/{name}"), size)
+    assert len(runs) == methods * seeds
+    learners = {run.config.learner for run in runs}
+    assert len(learners) == (2 if name == "ablation" else 1)  # one ablation is without lambda
+
+
 def test_table1_is_the_papers() -> None:
-    assert sweep_names() == ("paper/gridworld", "paper/table1", "paper/table2")
+    shipped = ("ablation", "combat", "robust", "share")
+    papers = ("paper/gridworld", "paper/table1", "paper/table2")
+    assert sweep_names() == (*papers, *(f"recipe/{name}" for name in shipped))
     assert not set(sweep_names()) & set(train_config_names())
     runs = load_sweep(find_sweep("paper/table1"))
     assert len(runs) == 7 * 4 * 5
