@@ -13,7 +13,6 @@ from typer.testing import CliRunner, Result
 from crash_coach_bringup.cli.faults.play import play
 from crash_coach_bringup.cli.faults.report import FILES
 from crash_coach_bringup.cli.faults.verb import app
-from crash_coach_bringup.cli.target import Target, load_target
 from crash_coach_bringup.cli.verbs.evaluate import Layout, Via
 from crash_coach_bringup.ros.probe import find_executable
 from crash_coach_common.contract import UserError
@@ -26,6 +25,7 @@ from crash_coach_pkg.coach.fault_scenario import (
 )
 from policy_pkg.play.conditions import crash_free
 from policy_pkg.play.evaluate import evaluate
+from policy_pkg.play.target import Target, load_target
 from policy_pkg.report.verdict import FaultRun, judge_run
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env

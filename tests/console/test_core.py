@@ -18,8 +18,8 @@ from crash_coach_console.episodes import MOST_GROUPS, Costs, EpisodeBook, Played
 from crash_coach_console.operating import OperatorError, victims_left, with_others
 from crash_coach_console.requests import Clear, Inject, RequestError, parse_request
 from crash_coach_console.team import LiveTeam, Plan, PlannedFault
+from crash_coach_pkg.coach.injection import injection
 from crash_coach_pkg.coach.parameters import parameter_specs
-from crash_coach_pkg.injection import injection
 from policy_pkg.statistics import mean_interval, wilson
 
 
@@ -64,22 +64,24 @@ def test_an_episode_counts_with_whom_it_had_crashed_once_it_is_settled() -> None
     book = EpisodeBook()
     book.end(6, True, 1.0, 9, 0.0)  # its beginning was not seen
     book.begin(7)
-    book.faulted(7, "robot_10")
+    book.faulted(7, "robot_10", "mute")
     book.end(7, False, -1.5, 20, 10.0)
     book.begin(8)
-    book.faulted(7, "robot_2")  # its event was on the way for longer
+    book.faulted(7, "robot_2", "mute")  # its event was on the way for longer
     assert list(book.settled(10.2)) == []
-    assert list(book.settled(10.6)) == [Played(7, ("robot_2", "robot_10"), False, -1.5, 20)]
-    book.faulted(7, "robot_3")  # too late for 7, and not for 8
+    assert list(book.settled(10.6)) == [
+        Played(7, ("robot_2", "robot_10"), ("mute",), False, -1.5, 20)
+    ]
+    book.faulted(7, "robot_3", "mute")  # too late for 7, and not for 8
     book.end(8, True, 2.0, 5, 11.0)
-    assert list(book.settled(12.0)) == [Played(8, (), True, 2.0, 5)]
+    assert list(book.settled(12.0)) == [Played(8, (), (), True, 2.0, 5)]
 
 
 def test_a_sim_that_starts_anew_is_counted_anew() -> None:
     book = EpisodeBook()
     for start_s in (0.0, 10.0):
         book.begin(0)
-        book.faulted(0, "robot_1")
+        book.faulted(0, "robot_1", "mute")
         book.end(0, True, 1.0, 3, start_s)
         assert [played.crashed for played in book.settled(start_s + 1)] == [("robot_1",)]
 
@@ -88,8 +90,8 @@ def test_costs_are_those_of_wilson_and_student_by_who_was_crashed() -> None:
     costs = Costs()
     returns = [1.0, 2.0, 4.0]
     for k, value in enumerate(returns):
-        costs.add(Played(k, (), True, value, 10))
-    costs.add(Played(3, ("robot_1",), False, -1.0, 30))
+        costs.add(Played(k, (), (), True, value, 10))
+    costs.add(Played(3, ("robot_1",), ("mute",), False, -1.0, 30))
     free, muted, every = costs.rows()
     success = wilson(3, 3)
     assert free["crashed"] == []
@@ -99,15 +101,26 @@ def test_costs_are_those_of_wilson_and_student_by_who_was_crashed() -> None:
     assert muted["crashed"] == ["robot_1"]
     assert muted["return"] == [-1.0, None, None]
     assert (every["crashed"], every["episodes"], every["steps"]) == (None, 4, 15.0)
+    assert [row["alike"] for row in (free, muted, every)] == [False, False, False]
     costs.forget()
     assert costs.rows() == []
+
+
+def test_one_episode_again_and_again_and_the_same_robots_crashed_otherwise() -> None:
+    costs = Costs()
+    for k in range(5):
+        costs.add(Played(k, ("robot_1",), ("mute",), True, 2.0, 7))
+        costs.add(Played(10 + k, ("robot_1",), ("random",), k > 2, 2.0 - k, 7))
+    mute, random = costs.rows(together=False)
+    assert (mute["modes"], mute["alike"], mute["return"]) == (["mute"], True, [2.0, None, None])
+    assert (random["modes"], random["alike"]) == (["random"], False)
 
 
 def test_many_different_victims_are_counted_by_number() -> None:
     costs = Costs()
     for k in range(MOST_GROUPS + 1):
-        costs.add(Played(k, (f"robot_{k}",), k % 2 == 0, 0.0, 1))
-    costs.add(Played(99, ("robot_1", "robot_2"), True, 0.0, 1))
+        costs.add(Played(k, (f"robot_{k}",), ("mute",), k % 2 == 0, 0.0, 1))
+    costs.add(Played(99, ("robot_1", "robot_2"), ("mute",), True, 0.0, 1))
     assert [(row["crashed"], row["episodes"]) for row in costs.rows()] == [
         (1, MOST_GROUPS + 1),
         (2, 1),

@@ -7,9 +7,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import pytest
-from conftest import WAIT_S, Teams
-from crash_coach_interfaces.msg import EpisodeState
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from console_teams import WAIT_S, Teams
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -18,7 +16,6 @@ PLACES = "crashCoach.stages[0].places().map((place) => [place.x, place.y])"
 MOVED = f"""(before) => {PLACES}.some(([x, y], i) =>
     Math.hypot(x - before[i][0], y - before[i][1]) > 3)"""
 PHONE = {"width": 375, "height": 740}
-LATCHED = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 DESK = {"width": 1600, "height": 1000}
 
 
@@ -42,7 +39,7 @@ def opened(browser: Browser, teams: Teams, address: str) -> Iterator[Page]:
     made.set_default_timeout(1000 * WAIT_S)
     made.goto(address)
     made.wait_for_function(
-        "crashCoach.stages.length && crashCoach.stages.every("
+        "() => crashCoach.stages.length && crashCoach.stages.every("
         "(stage) => stage.places().length > 0 && stage.status.ready)"
     )
     yield made
@@ -52,25 +49,15 @@ def opened(browser: Browser, teams: Teams, address: str) -> Iterator[Page]:
 
 
 def select(page: Page, robot: str) -> None:
-    """A click on the robot where it is drawn now."""
+    """A click on the robot where it is drawn, while the sim stands."""
+    page.get_by_role("button", name="Pause").click()
+    page.locator(".banner", has_text="paused").wait_for()
+    page.wait_for_function("() => !crashCoach.stages[0].dirty")
     at = page.evaluate(f"crashCoach.stages[0].places().find((place) => place.name === {robot!r})")
-    canvas = page.locator("canvas").first
-    canvas.click(position={"x": at["x"], "y": at["y"]})
-
-
-def crashed_at(teams: Teams, episode: int, step: int, team: int = 0) -> list[int]:
-    """Who was crashed in a control step that is still to come, or just was."""
-    found: list[list[int]] = []
-
-    def look(message: EpisodeState) -> None:
-        if (message.episode, message.step) == (episode, step + 1):
-            found.append(list(message.crashed))
-
-    client = teams.clients[team]
-    reader = client.node.create_subscription(EpisodeState, "/sim/episode", look, LATCHED)
-    client.until(lambda: bool(found), WAIT_S, f"step {step} of episode {episode}")
-    client.node.destroy_subscription(reader)
-    return found[0]
+    page.locator("canvas").first.click(position={"x": at["x"], "y": at["y"]})
+    page.locator(".chip[aria-pressed=true]", has_text=robot).wait_for()
+    page.get_by_role("button", name="Go on").click()
+    page.locator(".banner", has_text="paused").wait_for(state="hidden")
 
 
 def armed(answer: str) -> tuple[int, int]:
@@ -94,7 +81,7 @@ def test_a_click_mutes_a_robot_from_the_next_step_on_and_clear_all_clears(
     page.locator("#answer[data-state=ok]").wait_for()
     answer = page.locator("#answer").inner_text()
     assert answer.startswith("robot_1: mute from the next step on")
-    assert crashed_at(teams, *armed(answer)) == [1, 0]
+    assert teams.crashed_at(*armed(answer)) == [1, 0]
     page.locator(".chip[data-state=faulted]", has_text="robot_1").wait_for()
     page.locator(".events li", has_text="active").first.wait_for()
     page.get_by_role("button", name="Clear all").click()
@@ -109,7 +96,7 @@ def test_keys_crash_two_robots_and_clear_one_of_them(page: Page, teams: Teams) -
     for key in ("Escape", "2", "x"):
         page.keyboard.press(key)
     page.locator("#answer", has_text="robot_1, robot_2: mute").wait_for()
-    assert crashed_at(teams, *armed(page.locator("#answer").inner_text())) == [1, 1]
+    assert teams.crashed_at(*armed(page.locator("#answer").inner_text())) == [1, 1]
     page.keyboard.press("c")
     page.locator("#answer", has_text="robot_2: cleared; still crashed: robot_1").wait_for()
 
@@ -169,7 +156,6 @@ def test_nothing_is_cut_off(page: Page, size: dict[str, int]) -> None:
         assert box["x"] >= 0
         assert box["x"] + box["width"] <= size["width"]
     select(page, "robot_2")
-    page.locator(".chip[aria-pressed=true]", has_text="robot_2").wait_for()
 
 
 def test_every_control_has_a_name_for_readers_of_the_screen(page: Page) -> None:

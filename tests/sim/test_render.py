@@ -29,8 +29,8 @@ def frames(path_m: np.ndarray = PATH_M, crashed: tuple[int, ...] = ()) -> Frames
     """Two robots on a grid, without opponents."""
     steps, n = path_m.shape[0] - 1, path_m.shape[1]
     radii = (0.4,) * n
-    faults = np.zeros((steps, n), dtype=np.bool_)
-    faults[:, list(crashed)] = True
+    faults = np.zeros((steps, n), dtype=np.uint8)
+    faults[:, list(crashed)] = 1
     return Frames(
         scenario="buttons", seed=0, episode=3, dt_s=1.0,
         scene=Scene((10.0, 10.0), 1.0, radii, SITES_M), walled_m=(0.0, 0.0, 10.0, 10.0),
@@ -38,7 +38,9 @@ def frames(path_m: np.ndarray = PATH_M, crashed: tuple[int, ...] = ()) -> Frames
         positions_m=path_m.astype(np.float32), angles_rad=np.zeros((steps + 1, n), np.float32),
         health=np.ones((steps + 1, n), np.float32), shield=np.zeros((steps + 1, n), np.float32),
         damage=np.zeros((steps, n, n), np.float32),
-        sites_done=np.zeros((steps + 1, 2), np.bool_), crashed=faults,
+        sites_done=np.zeros((steps + 1, 2), np.bool_),
+        intents=np.zeros((steps, n), np.int32), actions=np.zeros((steps, n), np.int32),
+        faults=faults,
         returns=np.arange(steps + 1, dtype=np.float64), success=True, trajectory_hash="ab",
     )  # fmt: skip
 
@@ -61,7 +63,9 @@ def fight() -> Frames:
         health=np.array([(1, 1), (1, 1), (1, 0)], np.float32),
         shield=np.array([(1, 1), (0.5, 1), (0.5, 0)], np.float32),
         sites_done=np.zeros((3, 0), np.bool_),
-        crashed=np.zeros((2, 1), np.bool_),
+        faults=np.zeros((2, 1), np.uint8),
+        intents=np.zeros((2, 1), np.int32),
+        actions=np.zeros((2, 1), np.int32),
     )
 
 

@@ -49,6 +49,13 @@ def holds_bags(path: Path) -> bool:
     return bool(_below(path))
 
 
+def is_recording(path: Path) -> bool:
+    """Whether it is meant as one: ``find_bags`` tells what is wrong with unreadable ones."""
+    if path.is_file():
+        return path.suffix in (".mcap", ".db3")
+    return path.is_dir() and ((path / "metadata.yaml").exists() or holds_bags(path))
+
+
 def _below(path: Path) -> list[Bag]:
     if path.is_file() and path.suffix == ".mcap":
         return [Bag(str(path), (path,))]

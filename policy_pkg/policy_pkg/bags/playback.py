@@ -78,9 +78,9 @@ def play_back(recorded: RecordedEpisode, scenario: str | Path) -> Frames:
         same = same and np.array_equal(session.available, episode.available[step])
         if not (session.running and same):
             raise _differs(recorded, scenario, step)
-        crashed = episode.faults[step] != 0
-        session.advance(episode.actions[step], crashed.astype(np.uint8))
-        recorder.step(crashed, session.reward)
+        actions, faults = episode.actions[step], episode.faults[step]
+        session.advance(actions, (faults != 0).astype(np.uint8))
+        recorder.step(recorded.intents[step], actions, faults, session.reward)
     if session.running:
         session.cut()
     if session.trajectory_hash != recorded.trajectory_hash:

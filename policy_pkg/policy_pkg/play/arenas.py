@@ -33,6 +33,7 @@ ModeArray = npt.NDArray[np.uint8]
 class Executed:
     """One control step of all arenas."""
 
+    intent: IntArray  # (B, n) actions that the team wanted
     actions: IntArray  # (B, n) executed, after the faults
     modes: ModeArray  # (B, n) code of the fault in force, 0: none
     result: StepResult
@@ -178,7 +179,7 @@ class Arenas:
         result = self.env.step(actions)
         self.last_action[:] = actions
         self.returns += result.reward
-        return Executed(actions, modes, result)
+        return Executed(intent, actions, modes, result)
 
     def count_step(self, result: StepResult) -> ArenaArray:
         """Counts the step; returns the arenas whose episode it ended, in ascending order."""

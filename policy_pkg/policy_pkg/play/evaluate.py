@@ -254,7 +254,9 @@ class _Run:
             )
             self._courses[arena].act(done.actions[arena], reward)
             if arena in self._recorders:
-                self._recorders[arena].step(done.modes[arena] != 0, reward)
+                self._recorders[arena].step(
+                    done.intent[arena], done.actions[arena], done.modes[arena], reward
+                )
 
     def _result(self, arena: int, done: Executed) -> EpisodeResult:
         success = bool(done.result.success[arena])

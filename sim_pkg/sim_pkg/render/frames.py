@@ -8,7 +8,7 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
-from crash_coach_common.contract import BoolArray, FloatArray
+from crash_coach_common.contract import BoolArray, FloatArray, IntArray
 from sim_pkg.env import Env
 from sim_pkg.scenarios.base import Scene
 from sim_pkg.scenarios.skirmish.config import SkirmishConfig
@@ -59,18 +59,26 @@ class Frames:
     shield: FloatArray  # (T+1, d) share of the full shield
     damage: FloatArray  # (T, d, d) what i took from j in a step
     sites_done: BoolArray  # (T+1, m)
-    crashed: BoolArray  # (T, n) robots whose command a fault replaced
+    intents: IntArray  # (T, n) actions that the policies wanted; -1 where that is not known
+    actions: IntArray  # (T, n) actions executed
+    faults: npt.NDArray[np.uint8]  # (T, n) code of the fault in force, 0: none
     returns: npt.NDArray[np.float64]  # (T+1,) sum of the rewards so far
     success: bool
     trajectory_hash: str
 
     @property
     def steps(self) -> int:
-        return len(self.crashed)
+        return len(self.faults)
 
     @property
     def n_robots(self) -> int:
-        return int(self.crashed.shape[1])
+        return int(self.faults.shape[1])
+
+    @property
+    def crashed(self) -> BoolArray:
+        """(T, n) robots that a fault was in force on."""
+        crashed: BoolArray = self.faults != 0
+        return crashed
 
     @property
     def alive(self) -> BoolArray:
@@ -104,13 +112,23 @@ class Recorder:
         self._vitals: list[tuple[FloatArray, FloatArray]] = []
         self._sites_done: list[BoolArray] = []
         self._damage: list[FloatArray] = []
-        self._crashed: list[BoolArray] = []
+        self._intents: list[IntArray] = []
+        self._actions: list[IntArray] = []
+        self._faults: list[npt.NDArray[np.uint8]] = []
         self._returns = [0.0]
         self._look()
 
-    def step(self, crashed: BoolArray, reward: float) -> None:
-        """After a control step. crashed: (n,) whose command a fault replaced in it."""
-        self._crashed.append(crashed.copy())
+    def step(
+        self,
+        intents: IntArray,
+        actions: IntArray,
+        faults: npt.NDArray[np.uint8],
+        reward: float,
+    ) -> None:
+        """After a control step. (n,) wanted and executed actions, and codes of faults in force."""
+        self._intents.append(intents.astype(np.int32))
+        self._actions.append(actions.astype(np.int32))
+        self._faults.append(faults.astype(np.uint8))
         self._damage.append(self._env.hits[self._arena].copy())
         self._returns.append(self._returns[-1] + reward)
         self._look()
@@ -132,7 +150,9 @@ class Recorder:
             shield=np.stack([shield for _, shield in self._vitals]),
             damage=self._all_damage(),
             sites_done=np.stack(self._sites_done),
-            crashed=np.stack(self._crashed),
+            intents=np.stack(self._intents),
+            actions=np.stack(self._actions),
+            faults=np.stack(self._faults),
             returns=np.array(self._returns),
             success=success,
             trajectory_hash=trajectory_hash,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -14,11 +16,24 @@ from crash_coach_console.source import Source
 
 
 def console(
+    what: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[WHAT]...",
+            help="Instead of graphs: recordings, runs or checkpoints (RUN@best: its best one), or "
+            "scripted:NAME.",
+        ),
+    ] = None,
     domain: Annotated[
         list[int] | None,
         typer.Option(help="ROS domain of a graph; two of them stand side by side.", min=0, max=232),
     ] = None,
     namespace: Annotated[str, typer.Option(help="Namespace of the graphs.")] = "",
+    scenario: Annotated[
+        str | None,
+        typer.Option(help="Scenario name or YAML file of what is shown; default: its own."),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the episodes that a run plays.", min=0)] = 0,
     port: Annotated[
         int, typer.Option(help="Port of the page; 0: any free one.", min=0, max=65535)
     ] = PORT,
@@ -32,16 +47,50 @@ def console(
         bool, typer.Option("--end-faults", help="Every fault ends with the console.")
     ] = False,
 ) -> None:
-    """Shows a running team as a web page: look, click a robot, crash it, read what it costs."""
+    """Shows a team as a web page: look, click a robot, crash it, read what it costs.
+
+    Without WHAT, the graph that runs on the domain. A run or a checkpoint plays episodes here,
+    without ROS, and a run shows its curves; a recording is played as it was.
+    """
     access = Access(host, token)
-    # Imported here: no other verb should wait for ROS.
+    if what and (domain or namespace or end_faults):
+        raise UserError(f"{what[0]}: --domain, --namespace and --end-faults are a graph's")
+    if what:
+        sources = [shown(i, name, scenario, seed) for i, name in enumerate(what)]
+    else:
+        sources = graphs(domain or [None], namespace, end_faults)
+    serve(sources, access, port, lambda url: typer.echo(f"console: {url}"))
+
+
+def graphs(domains: Sequence[int | None], namespace: str, end_faults: bool) -> list[Source]:
+    """Imports ROS, which no other verb and no recording should wait for."""
     from crash_coach_console.ros.graph_source import GraphSource
 
-    domains: list[int | None] = list(domain) if domain else [None]
-    sources: list[Source] = [
-        GraphSource(i, "", number, namespace, end_faults) for i, number in enumerate(domains)
-    ]
-    serve(sources, access, port, lambda url: typer.echo(f"console: {url}"))
+    return [GraphSource(i, "", number, namespace, end_faults) for i, number in enumerate(domains)]
+
+
+def shown(number: int, name: str, scenario: str | None, seed: int) -> Source:
+    """What the command line names.
+
+    Raises:
+        UserError: it is not there, damaged, or its scenario is not known.
+    """
+    from crash_coach_console.episode_source import EpisodeSource
+    from crash_coach_console.player import Player
+    from crash_coach_console.recording import Recording
+    from crash_coach_console.run_source import RunSource
+    from policy_pkg.bags.bag import is_recording
+    from policy_pkg.play.target import SCRIPTED, load_target
+    from policy_pkg.report.finished_runs import has_begun
+    from policy_pkg.train.run_dir import RUN
+
+    path = Path(name)
+    if not name.startswith(SCRIPTED):
+        if is_recording(path):
+            return EpisodeSource(number, Recording(path, scenario))
+        if (path / RUN).is_file() and not has_begun(path):
+            return RunSource(number, path)
+    return EpisodeSource(number, Player(load_target(name, scenario), seed))
 
 
 def main() -> None:

@@ -28,12 +28,13 @@ class Played:
 
     episode: int
     crashed: tuple[str, ...]  # robots that a fault was in force on, in robot order
+    modes: tuple[str, ...]  # of these faults, each once, sorted
     success: bool
     episode_return: float
     steps: int
 
     def __str__(self) -> str:
-        who = ", ".join(self.crashed) or "nobody"
+        who = ", ".join(self.crashed) + f" ({', '.join(self.modes)})" if self.crashed else "nobody"
         done = "success" if self.success else "no success"
         return (
             f"episode {self.episode}: {done}, return {self.episode_return:.2f}, "
@@ -49,7 +50,7 @@ class EpisodeBook:
     """
 
     _begun: set[int] = field(default_factory=set)
-    _faulted: dict[int, set[str]] = field(default_factory=dict)
+    _faulted: dict[int, set[tuple[str, str]]] = field(default_factory=dict)
     _ended: deque[tuple[float, int, bool, float, int]] = field(default_factory=deque)
     _settled: int = -1
 
@@ -60,10 +61,10 @@ class EpisodeBook:
             self._faulted = {k: v for k, v in self._faulted.items() if k >= episode}
         self._begun = {k for k in self._begun if k >= episode - 1} | {episode}
 
-    def faulted(self, episode: int, robot: str) -> None:
+    def faulted(self, episode: int, robot: str, mode: str) -> None:
         """A fault is in force on ``robot``."""
         if episode > self._settled:
-            self._faulted.setdefault(episode, set()).add(robot)
+            self._faulted.setdefault(episode, set()).add((robot, mode))
 
     def end(
         self, episode: int, success: bool, episode_return: float, steps: int, now_s: float
@@ -78,9 +79,11 @@ class EpisodeBook:
         while self._ended and now_s - self._ended[0][0] >= wait_s:
             _, episode, success, episode_return, steps = self._ended.popleft()
             self._settled = max(self._settled, episode)
-            crashed = tuple(sorted(self._faulted.pop(episode, ()), key=_natural))
+            faults = self._faulted.pop(episode, set())
+            crashed = tuple(sorted({robot for robot, _ in faults}, key=_natural))
+            modes = tuple(sorted({mode for _, mode in faults}))
             self._faulted = {k: v for k, v in self._faulted.items() if k > episode}
-            yield Played(episode, crashed, success, episode_return, steps)
+            yield Played(episode, crashed, modes, success, episode_return, steps)
 
 
 def _natural(name: str) -> tuple[str, int]:
@@ -92,58 +95,66 @@ def _natural(name: str) -> tuple[str, int]:
 @dataclass
 class _Group:
     successes: int = 0
-    steps: int = 0
+    steps: array[int] = field(default_factory=lambda: array("l"))
     returns: array[float] = field(default_factory=lambda: array("d"))
 
 
 class Costs:
-    """Success and return of the episodes watched, crash-free and by who was crashed."""
+    """Success and return of the episodes watched, crash-free and by who was crashed how."""
 
     def __init__(self) -> None:
-        self._groups: dict[tuple[str, ...], _Group] = {}
+        self._groups: dict[tuple[tuple[str, ...], tuple[str, ...]], _Group] = {}
 
     def add(self, played: Played) -> None:
-        group = self._groups.setdefault(played.crashed, _Group())
+        group = self._groups.setdefault((played.crashed, played.modes), _Group())
         group.successes += played.success
-        group.steps += played.steps
+        group.steps.append(played.steps)
         group.returns.append(played.episode_return)
 
     def forget(self) -> None:
         """Counts anew."""
         self._groups.clear()
 
-    def rows(self) -> list[dict[str, Any]]:
+    def rows(self, together: bool = True) -> list[dict[str, Any]]:
         """JSON values, crash-free first, then by how many were crashed, most episodes first.
 
-        ``crashed``: names; where there are more than MOST_GROUPS different ones, their number; null
-        for all episodes together, the last row. ``success`` and ``return``: value, low and high end
-        of a 95 % interval (Wilson's; Student's t, null where one episode gives none).
+        ``crashed``: names, and ``modes`` of their faults; where there are more than MOST_GROUPS
+        different ones, their number; null for all episodes ``together``, the last row.
+        ``success`` and ``return``: value, low and high end of a 95 % interval (Wilson's; Student's
+        t, null where one episode gives none). ``alike``: all episodes ended alike; they may be one
+        episode again and again, of which no interval says anything.
         """
         groups = self._groups
         if len(groups) <= MOST_GROUPS:
-            order = sorted(groups, key=lambda who: (len(who), -len(groups[who].returns), who))
-            rows = [{"crashed": list(who), **_summary([groups[who]])} for who in order]
-        else:
+            order = sorted(groups, key=lambda k: (len(k[0]), -len(groups[k].returns), k))
             rows = [
-                {"crashed": k, **_summary([g for who, g in groups.items() if len(who) == k])}
-                for k in sorted({len(who) for who in groups})
+                {"crashed": list(k[0]), "modes": list(k[1]), **_summary([groups[k]])} for k in order
             ]
-        if len(rows) > 1:
+        else:
+            sizes = sorted({len(crashed) for crashed, _ in groups})
+            rows = [
+                {"crashed": n, **_summary([g for k, g in groups.items() if len(k[0]) == n])}
+                for n in sizes
+            ]
+        if together and len(rows) > 1:
             rows.append({"crashed": None, **_summary(list(groups.values()))})
         return rows
 
 
 def _summary(groups: Sequence[_Group]) -> dict[str, Any]:
     returns = np.concatenate([np.array(group.returns) for group in groups])
-    n = len(returns)
-    success = wilson(sum(group.successes for group in groups), n)
+    steps = np.concatenate([np.array(group.steps) for group in groups])
+    n, successes = len(returns), sum(group.successes for group in groups)
+    success = wilson(successes, n)
     told: list[float | None] = [float(returns.mean()), None, None]
-    if n > 1:
+    alike = n > 1 and successes in (0, n) and np.ptp(returns) == 0 and np.ptp(steps) == 0
+    if n > 1 and not alike:
         mean = mean_interval(returns)
         told = [mean.value, mean.low, mean.high]
     return {
         "episodes": n,
         "success": [success.value, success.low, success.high],
         "return": told,
-        "steps": sum(group.steps for group in groups) / n,
+        "steps": float(steps.mean()),
+        "alike": bool(alike),
     }

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from crash_coach_common.contract import UserError
+from crash_coach_pkg.coach.config import CoachConfig
 from crash_coach_pkg.coach.parameters import NOBODY, Value, parameter_specs
 
 AT_START = ("robots", "roles", "dt_s", "fault_scenario", "follow_sim")
@@ -38,6 +39,16 @@ def with_others(wanted: Mapping[str, Value], settings: Mapping[str, Value]) -> d
         return dict(wanted)
     more = [str(name) for name in chosen if name not in before]
     return {**wanted, "victims": (*before, *more)}
+
+
+def joined(before: CoachConfig, wanted: CoachConfig) -> CoachConfig:
+    """``with_others`` for a coach without parameters."""
+    changing = {"victims": (), "start_step": 0}
+    alike = before.model_copy(update=changing) == wanted.model_copy(update=changing)
+    if not alike:
+        return wanted
+    more = (name for name in wanted.victims if name not in before.victims)
+    return wanted.model_copy(update={"victims": (*before.victims, *more)})
 
 
 def victims_left(robots: Sequence[str], settings: Mapping[str, Value]) -> tuple[str, ...]:

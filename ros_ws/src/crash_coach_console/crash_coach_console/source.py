@@ -7,7 +7,8 @@ from typing import Literal, Protocol
 from crash_coach_console.board import Board
 from crash_coach_console.requests import Request
 
-Kind = Literal["graph", "episode", "run"]
+Kind = Literal["graph", "recording", "episodes", "run"]
+"""run: a training's curves alone."""
 
 
 class Source(Protocol):

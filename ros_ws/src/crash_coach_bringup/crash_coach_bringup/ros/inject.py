@@ -12,8 +12,8 @@ from std_srvs.srv import Trigger
 
 from crash_coach_bringup.ros.client import GraphClient, graph_client
 from crash_coach_common.contract import UserError
+from crash_coach_pkg.coach.injection import describe, injection
 from crash_coach_pkg.faults import check_parameters
-from crash_coach_pkg.injection import describe, injection
 
 COACH = "/coach"
 

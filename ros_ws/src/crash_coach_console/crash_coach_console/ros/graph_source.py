@@ -37,8 +37,8 @@ from crash_coach_console.ros import convert
 from crash_coach_console.ros.graph_link import GraphLink
 from crash_coach_console.source import Kind
 from crash_coach_console.team import LiveTeam
+from crash_coach_pkg.coach.injection import describe, injection
 from crash_coach_pkg.coach.parameters import Value
-from crash_coach_pkg.injection import describe, injection
 
 POLL_S = 1.0
 SHOW_S = 0.2
@@ -129,12 +129,12 @@ class GraphSource:
     def on_event(self, message: FaultEvent) -> None:
         kind = message.kind
         if kind == FaultEvent.EFFECT:
-            self._book.faulted(message.episode, message.robot)
+            self._book.faulted(message.episode, message.robot, message.mode)
             key = (message.episode, message.step)
             self._team.effect(message.robot, message.mode, key, message.intent, message.applied)
             return
         if kind == FaultEvent.ACTIVE:
-            self._book.faulted(message.episode, message.robot)
+            self._book.faulted(message.episode, message.robot, message.mode)
             self._team.active(message.robot, message.mode, message.episode)
         elif kind in (FaultEvent.CLEARED, FaultEvent.EXPIRED):
             self._team.cleared(message.robot)

@@ -3,10 +3,12 @@
 import { shortName } from "./dom.js";
 
 const LEAST_BODY_PX = 5;
+const SMALL_M = 16; // an arena that is always shown whole
+const LEAST_SHARE = 0.5; // of a larger one: never less than this is shown
+const AROUND_M = 2;
 
-/** Metres to pixels: the part between the walls, whole, centred; north is up. */
-export function project(arena, width, height) {
-  const [x1, y1, x2, y2] = arena.walled_m;
+/** Metres to pixels: the part [x1, y1, x2, y2], whole, centred; north is up. */
+export function project([x1, y1, x2, y2], width, height) {
   const margin = Math.max(14, 0.03 * Math.min(width, height));
   const scale = Math.max(
     0.1, Math.min((width - 2 * margin) / (x2 - x1), (height - 2 * margin) / (y2 - y1)),
@@ -18,6 +20,26 @@ export function project(arena, width, height) {
     x: (x) => left + scale * (x - x1),
     y: (y) => top + scale * (y2 - y),
   };
+}
+
+/** What to look at: the whole arena, or of a large one without places the part where things are. */
+export function lookAt(arena, state) {
+  const [x1, y1, x2, y2] = arena.walled_m;
+  const size = Math.max(x2 - x1, y2 - y1);
+  if (arena.cell_m > 0 || arena.sites_m.length || size <= SMALL_M) return arena.walled_m;
+  const alive = arena.actors.flatMap((_, i) => (state.health[i] > 0 ? [i] : []));
+  if (!alive.length) return arena.walled_m;
+  const [xs, ys] = [alive.map((i) => state.poses[3 * i]), alive.map((i) => state.poses[3 * i + 1])];
+  const [left, right] = widen(Math.min(...xs), Math.max(...xs), LEAST_SHARE * size, x1, x2);
+  const [low, high] = widen(Math.min(...ys), Math.max(...ys), LEAST_SHARE * size, y1, y2);
+  return [left, low, right, high];
+}
+
+/** At least so long, with room around, and within the limits. */
+function widen(from, to, least, low, high) {
+  const length = Math.min(high - low, Math.max(to - from + 2 * AROUND_M, least));
+  const start = Math.min(high - length, Math.max(low, (from + to - length) / 2));
+  return [start, start + length];
 }
 
 export function bodyRadius(actor, view) {

@@ -61,7 +61,7 @@ export class Faults {
 
   showMode() {
     const mode = this.mode();
-    setText(this.part("mode-summary"), mode.summary);
+    setText(this.part("mode-summary"), mode.summary.replaceAll("`", ""));
     this.part("parameters").replaceChildren(...mode.parameters.map((parameter) => {
       const unit = parameter.unit === "1" ? "" : ` [${parameter.unit}]`;
       const id = `parameter-${parameter.name}`;
@@ -91,11 +91,13 @@ export class Faults {
       : "Click a robot, in the arena or in the list.");
     setText(this.part("crash"), names.length ? `Crash: ${mode}` : "Crash");
     this.part("crash").disabled = !names.length;
-    const crashed = names.some((name) => this.page.isVictim(name));
-    this.part("clear").disabled = !crashed;
+    this.part("clear").disabled = !names.some((name) => this.page.isVictim(name));
     const ends = this.page.stages.some((stage) => stage.status.ends_faults);
-    setText(this.part("stays"), ends
-      ? "Faults end with the console; closing this page leaves them."
+    const played = this.page.teams().every((stage) => stage.kind === "episodes");
+    setText(this.part("stays"), played
+      ? "The same episode is played again with the crash, from this step on. One kind of fault at a "
+        + "time: another kind replaces it."
+      : ends ? "Faults end with the console; closing this page leaves them."
       : "Closing this page or the console leaves faults in force: the coach keeps them until they "
         + "are cleared. One kind of fault at a time: another kind replaces it.");
   }

@@ -34,6 +34,8 @@ class Page {
     const place = document.getElementById("stages");
     place.replaceChildren(...this.stages.map((stage) => stage.root));
     document.body.dataset.stages = String(this.stages.length);
+    const over = this.stages.every((stage) => stage.kind !== "graph");
+    document.body.dataset.over = String(over);
     this.faults.setModes(hello.modes);
     this.faults.setTeams(this.teams());
     document.getElementById("controls").hidden = !this.teams().length;
@@ -47,7 +49,7 @@ class Page {
 
   /** Stages whose robots can be crashed. */
   teams() {
-    return this.stages.filter((stage) => stage.kind === "graph");
+    return this.stages.filter((stage) => stage.crashable);
   }
 
   teamChanged() {
@@ -81,7 +83,7 @@ class Page {
   }
 
   crash(stage, name) {
-    if (stage.kind !== "graph") return;
+    if (!stage.crashable) return;
     this.selectEverywhere([name]);
     this.faults.crash([name]);
   }
@@ -122,9 +124,14 @@ class Page {
     define("c", "c", "clear the selected robots", () => this.faults.clear());
     define("C", "Shift c", "clear all", () => this.faults.clearAll());
     define(" ", "space", "pause, or go on", () => {
-      this.askAll("pause", (stage) => ({ on: !stage.status.paused }));
+      this.askAll("pause", (stage) => ({ on: !stage.paused() }));
     });
     define(".", ".", "one step while paused", () => this.askAll("step"));
+    define(",", ",", "one step back, of what is over", () => {
+      for (const stage of this.stages) {
+        if (stage.kind !== "graph") this.ask(stage, "step", { by: -1 });
+      }
+    });
     define("r", "r", "the next episode", () => this.askAll("reset"));
     define("t", "t", "dark or light", () => this.turnTheme());
     define("?", "?", "these keys", () => this.showHelp());

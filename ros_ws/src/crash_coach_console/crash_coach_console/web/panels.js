@@ -25,25 +25,29 @@ export function showCosts(place, rows) {
   place.replaceChildren(table);
 }
 
-function who(crashed) {
+function who({ crashed, modes }) {
   if (crashed === null) return "all episodes";
   if (typeof crashed === "number") return `${crashed} robots`;
-  return crashed.length ? crashed.join(", ") : "nobody";
+  return crashed.length ? `${crashed.join(", ")}: ${modes.join(", ")}` : "nobody";
 }
 
 function costRow(row) {
   const [rate, low, high] = row.success;
-  const bar = make("span", { class: "interval", "aria-hidden": "true" }, [
+  const band = row.alike ? [] : [
     make("i", { style: `left:${100 * low}%;width:${100 * (high - low)}%` }),
+  ];
+  const bar = make("span", { class: "interval", "aria-hidden": "true" }, [
+    ...band,
     make("b", { style: `left:${100 * rate}%` }),
   ]);
+  const range = row.alike ? "all ended alike" : `${Math.round(100 * low)}–${Math.round(100 * high)}`;
   const [mean, from, to] = row.return;
   const spread = from === null ? "" : ` ± ${((to - from) / 2).toFixed(2)}`;
   return make("tr", {}, [
-    make("th", { scope: "row", text: who(row.crashed) }),
+    make("th", { scope: "row", text: who(row) }),
     make("td", { text: row.episodes }),
     make("td", {}, [
-      bar, make("span", { text: `${percent(rate)} (${percent(low)}–${percent(high)})` }),
+      bar, make("span", { text: `${percent(rate)} (${range})` }),
     ]),
     make("td", { text: `${mean.toFixed(2)}${spread}` }),
   ]);

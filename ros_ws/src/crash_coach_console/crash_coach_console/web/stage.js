@@ -4,10 +4,13 @@ import * as draw from "./arena.js";
 import { modeColour, palette } from "./colours.js";
 import { find, make, setText } from "./dom.js";
 import { Motion, Trails } from "./motion.js";
+import { Curves } from "./curves.js";
 import { showCoach, showCosts, showEvents, showSteps } from "./panels.js";
+import { Timeline } from "./timeline.js";
 
 const HIT_MS = 350;
 const NEAR_PX = 14;
+const CAMERA_MS = 900;
 
 export class Stage {
   /**
@@ -24,6 +27,7 @@ export class Stage {
     this.motion = new Motion();
     this.trails = new Trails();
     this.arena = null;
+    this.camera = null;
     this.team = { robots: [], rate: null };
     this.status = { alive: {}, ready: false, paused: false };
     this.hits = [];
@@ -34,9 +38,12 @@ export class Stage {
     const copy = /** @type {DocumentFragment} */ (template.content.cloneNode(true));
     this.root = /** @type {HTMLElement} */ (find(copy, ".stage"));
     this.root.dataset.kind = source.kind;
+    this.crashable = source.kind === "graph" || source.kind === "episodes";
     this.canvas = /** @type {HTMLCanvasElement} */ (find(copy, "canvas"));
     this.part = (name) => find(this.root, name);
     setText(this.part(".title"), source.title);
+    this.timeline = new Timeline(this.root, modes, (type, fields) => page.ask(this, type, fields));
+    this.curves = new Curves(this.part(".curves"));
     this.listen();
     new ResizeObserver(() => this.resize()).observe(this.part(".arena"));
   }
@@ -45,7 +52,7 @@ export class Stage {
     const act = (name, type, fields) => {
       this.part(name).addEventListener("click", () => this.page.ask(this, type, fields?.()));
     };
-    act(".pause", "pause", () => ({ on: !this.status.paused }));
+    act(".pause", "pause", () => ({ on: !this.paused() }));
     act(".step", "step");
     act(".back", "step", () => ({ by: -1 }));
     act(".reset", "reset");
@@ -75,6 +82,7 @@ export class Stage {
     switch (message.type) {
       case "arena":
         this.arena = message;
+        this.camera = null;
         this.trails.clear();
         this.showRobots();
         this.label();
@@ -103,6 +111,13 @@ export class Stage {
         this.settings = message.settings;
         showCoach(this.part(".coach .rows"), message.settings, this.team);
         break;
+      case "timeline":
+        this.timeline.show(message);
+        this.showStatus();
+        break;
+      case "curves":
+        this.curves.show(message);
+        break;
       default:
         console.warn(`unknown message ${message.type}`);
     }
@@ -110,11 +125,14 @@ export class Stage {
 
   takeState(state) {
     const now = performance.now();
+    const before = this.motion.newest;
+    if (before && (before.episode !== state.episode || before.step > state.step)) this.hits = [];
     this.motion.push(state, now);
     this.trails.push(state, this.robotIndexes());
     for (let k = 0; k + 1 < state.hits.length; k += 2) {
       this.hits.push({ from: state.hits[k], to: state.hits[k + 1], born: now });
     }
+    this.timeline.seen(state.step);
     this.showFacts(state);
     this.showHealth(state);
   }
@@ -132,12 +150,19 @@ export class Stage {
       + `${state.time_s.toFixed(1)} s · return ${state.return.toFixed(2)}${end}`);
   }
 
+  /** Whether the sim stands, or the recorded episode. */
+  paused() {
+    return this.kind === "graph" ? this.status.paused : !this.timeline.playing;
+  }
+
   showStatus() {
-    const { alive, paused, title } = this.status;
+    const { alive, title } = this.status;
+    const live = this.kind === "graph";
+    const paused = live && this.paused();
     if (title) setText(this.part(".title"), title);
-    setText(this.part(".pause"), paused ? "Go on" : "Pause");
+    setText(this.part(".pause"), this.paused() ? (live ? "Go on" : "Play") : "Pause");
     const banner = this.part(".banner");
-    const silent = this.kind === "graph" && !alive.sim && !alive.gate;
+    const silent = live && !alive.sim && !alive.gate;
     banner.hidden = !silent && !paused;
     setText(banner, silent ? "no team on this graph yet" : "paused");
   }
@@ -240,7 +265,18 @@ export class Stage {
 
   view() {
     const ratio = window.devicePixelRatio || 1;
-    return draw.project(this.arena, this.canvas.width / ratio, this.canvas.height / ratio);
+    return draw.project(this.camera ?? this.arena.walled_m, this.canvas.width / ratio,
+      this.canvas.height / ratio);
+  }
+
+  /** Towards what is to be looked at, calmly; whether it is still on its way. */
+  moveCamera(state, now) {
+    const target = draw.lookAt(this.arena, state);
+    const share = 1 - Math.exp(-(now - (this.movedAt ?? now)) / CAMERA_MS);
+    this.movedAt = now;
+    const from = this.camera ?? target;
+    this.camera = from.map((x, i) => x + share * (target[i] - x));
+    return this.camera.some((x, i) => Math.abs(x - target[i]) > 0.01);
   }
 
   robotAt(event) {
@@ -263,7 +299,7 @@ export class Stage {
     const drawn = this.arena && this.motion.at(now);
     this.hits = this.hits.filter((hit) => now - hit.born < HIT_MS);
     if (!drawn || (drawn.settled && !this.dirty && !this.hits.length)) return;
-    this.dirty = !drawn.settled;
+    this.dirty = this.moveCamera(drawn.state, now) || !drawn.settled;
     const ctx = this.canvas.getContext("2d");
     const ratio = window.devicePixelRatio || 1;
     ctx.setTransform(ratio, 0, 0, ratio, 0, 0);

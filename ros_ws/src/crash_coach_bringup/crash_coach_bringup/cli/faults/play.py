@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from crash_coach_bringup.cli.output import CliError
-from crash_coach_bringup.cli.target import Target
 from crash_coach_bringup.cli.verbs.evaluate import Layout, Via
 from crash_coach_common.contract import EnvSpec
 from crash_coach_pkg.coach.config import TeamSpec
@@ -13,6 +12,7 @@ from crash_coach_pkg.coach.fault_scenario import FaultScenario, ScenarioPlanner
 from crash_coach_pkg.faults.action_tools import ACTION_OFFERS
 from policy_pkg.play.conditions import Planned, crash_free
 from policy_pkg.play.evaluate import Evaluation, Scripted, evaluate
+from policy_pkg.play.target import Target
 from policy_pkg.report.verdict import FaultRun, judge_run
 from sim_pkg.env import make_env
 

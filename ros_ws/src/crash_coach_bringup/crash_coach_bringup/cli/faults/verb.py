@@ -14,7 +14,6 @@ from crash_coach_bringup.cli.faults.docs import generated, update
 from crash_coach_bringup.cli.faults.play import check_scenario, play
 from crash_coach_bringup.cli.faults.report import Played, check_target, measured, write
 from crash_coach_bringup.cli.output import CliError, check_file_target, console, table
-from crash_coach_bringup.cli.target import HELP, load_target
 from crash_coach_bringup.cli.verbs.evaluate import (
     MOST_EPISODES,
     Layout,
@@ -28,6 +27,7 @@ from crash_coach_pkg.coach.fault_scenario import (
     find_fault_scenario,
     load_fault_scenario,
 )
+from policy_pkg.play.target import HELP, load_target
 from policy_pkg.report.verdict import FaultRun
 
 COLOURS = {"passed": "green", "failed": "red", "error": "red"}

@@ -26,10 +26,10 @@ from crash_coach_bringup.cli.output import (
     table,
     write_json,
 )
-from crash_coach_bringup.cli.target import HELP, Target, load_target
 from policy_pkg.play.conditions import Condition
 from policy_pkg.play.evaluate import Evaluation, Scripted
 from policy_pkg.play.evaluate_processes import evaluate_on
+from policy_pkg.play.target import HELP, Target, load_target
 from policy_pkg.statistics import Estimate, difference
 from sim_pkg.trajectory import combine
 

@@ -16,12 +16,12 @@ from crash_coach_bringup.cli.output import (
     console,
     write_json,
 )
-from crash_coach_bringup.cli.target import HELP, load_target
 from crash_coach_common.strict_yaml import ConfigError
-from policy_pkg.bags.bag import holds_bags
+from policy_pkg.bags.bag import is_recording
 from policy_pkg.bags.playback import play_back, read_episode
 from policy_pkg.play.conditions import Condition
 from policy_pkg.play.evaluate import record
+from policy_pkg.play.target import HELP, load_target
 from sim_pkg.render.frames import Frames
 
 FILMS, STILLS = (".mp4", ".gif"), (".png",)
@@ -78,14 +78,6 @@ def show(frames: Frames, out: Path) -> None:
     told = f"episode {frames.episode}: {done} after {frames.steps} steps; crashed: {who}"
     console.print(told, highlight=False)
     console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
-
-
-def is_recording(name: str) -> bool:
-    """Whether it is meant as one: bags.bag tells what is wrong with those that cannot be read."""
-    path = Path(name)
-    if path.is_file():
-        return path.suffix in (".mcap", ".db3")
-    return path.is_dir() and ((path / "metadata.yaml").exists() or holds_bags(path))
 
 
 def recorded(name: str, episode: int | None, scenario: str | None) -> tuple[Frames, dict[str, Any]]:
@@ -148,7 +140,7 @@ def render(
     check_out(out)
     if not 0.01 <= speed <= 1000:
         raise CliError(f"--speed {speed}: 0.01 to 1000 times real time")
-    if is_recording(team):
+    if is_recording(Path(team)):
         refuse_options_of_a_team(context)
         frames, which = recorded(team, episode, scenario)
     else:

@@ -1,11 +1,11 @@
-"""Which team a verb plays: a trained one from its folder, or `scripted:NAME`."""
+"""Which team is meant: a trained one, by its folder, or `scripted:NAME`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from crash_coach_bringup.cli.output import CliError
+from crash_coach_common.contract import UserError
 from policy_pkg.checkpoint import PolicyBundle, load_policy
 from policy_pkg.play.evaluate import Scripted
 from sim_pkg.env import make_env
@@ -29,13 +29,13 @@ def load_target(name: str, scenario: str | None) -> Target:
 
     Raises:
         CheckpointError: no checkpoint there, or a broken one.
-        CliError: a scripted team without a scenario.
+        UserError: a scripted team without a scenario.
         ConfigError: unknown or wrong scenario.
     """
     if not name.startswith(SCRIPTED):
         bundle = load_policy(Path(name))
         return Target(name, bundle, scenario or bundle.scenario, bundle.robots)
     if scenario is None:
-        raise CliError(f"{name}: --scenario is needed; only a trained team knows its own")
+        raise UserError(f"{name}: --scenario is needed; only a trained team knows its own")
     robots = make_env(scenario, 1).spec.robots
     return Target(name, Scripted(name.removeprefix(SCRIPTED)), scenario, robots)
