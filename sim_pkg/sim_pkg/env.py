@@ -24,20 +24,11 @@ from crash_coach_common.strict_yaml import (
     validate,
 )
 from sim_pkg.scenario_files import find_scenario, scenario_names
-from sim_pkg.scenarios import buttons, coverage, transport
-from sim_pkg.scenarios.base import Buffers, Kind, Scenario, Scene
-from sim_pkg.scenarios.skirmish import rules as skirmish
+from sim_pkg.scenarios.base import Buffers, Scenario, Scene
+from sim_pkg.scenarios.kinds import KINDS
 from sim_pkg.world import Float64Array, World
 
-__all__ = ["KINDS", "Env", "make_env", "scenario_names"]
-
-KINDS: dict[str, Kind] = {
-    "buttons": buttons.KIND,
-    "coverage": coverage.KIND,
-    "skirmish": skirmish.KIND,
-    "transport": transport.KIND,
-}
-"""The kinds of scenario by the ``kind`` key of their YAML; add your own here."""
+__all__ = ["Env", "make_env", "scenario_names"]
 
 
 def make_env(scenario: str | Path, n_arenas: int) -> Env:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 
 from pydantic import ValidationError
 
 from crash_coach_common.contract import UserError
+from crash_coach_common.plugins import load, place
 from crash_coach_pkg.faults.adversarial import Adversarial
 from crash_coach_pkg.faults.base import (
     CommandFault,
@@ -83,30 +84,17 @@ def _known_modes() -> dict[str, type[FaultMode]]:
     if not _installed_read:
         found = dict(_modes)
         for point in entry_points(group=ENTRY_POINT_GROUP):
-            mode = _load(point)
+            mode = load(point)
             if mode in found.values():  # registered before
                 continue
             try:
                 _check(mode, found)
             except ValueError as error:
-                raise UserError(f"{_place(point)} cannot be used: {error}") from error
+                raise UserError(f"{place(point)} cannot be used: {error}") from error
             found[mode.name] = mode
         _modes.update(found)
         _installed_read = True
     return _modes
-
-
-def _load(point: EntryPoint) -> type[FaultMode]:
-    try:
-        mode: type[FaultMode] = point.load()
-    except (ImportError, AttributeError) as error:
-        raise UserError(f"{_place(point)} cannot be loaded: {error}") from error
-    return mode
-
-
-def _place(point: EntryPoint) -> str:
-    package = point.dist.name if point.dist is not None else "an unknown package"
-    return f"entry point {point.name} = {point.value} ({ENTRY_POINT_GROUP}) of {package}"
 
 
 def mode_names() -> tuple[str, ...]:

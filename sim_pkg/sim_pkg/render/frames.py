@@ -3,40 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
 
 from crash_coach_common.contract import BoolArray, FloatArray, IntArray
 from sim_pkg.env import Env
-from sim_pkg.scenarios.base import Scene
-from sim_pkg.scenarios.skirmish.config import SkirmishConfig
-from sim_pkg.scenarios.skirmish.layout import (
-    STATE_HEALTH,
-    STATE_OPPONENT_HEALTH,
-    STATE_OPPONENT_SHIELD,
-    STATE_SHIELD,
-)
+from sim_pkg.scenarios.base import Actor, Scene, Side
 
-
-class Side(IntEnum):
-    """Whose a body is."""
-
-    ROBOTS = 0
-    OPPONENTS = 1
-    THINGS = 2
-
-
-@dataclass(frozen=True)
-class Actor:
-    """One body of an episode; a disc, or where it has a size, a box of (width, height)."""
-
-    name: str
-    kind: str
-    side: Side
-    radius_m: float
-    size_m: tuple[float, float] | None = None
+__all__ = ["Actor", "Frames", "Recorder", "Side", "actors", "vitals", "walled_m"]
 
 
 @dataclass(frozen=True)
@@ -174,27 +149,16 @@ class Recorder:
 
 def walled_m(env: Env) -> tuple[float, float, float, float]:
     """x1, y1, x2, y2 of the part of the arena between its walls."""
-    if isinstance(env.config, SkirmishConfig):
-        return env.config.free_m
-    width, height = env.scene.arena_m
-    return (0.0, 0.0, width, height)
+    return env.scene.walled_m or (0.0, 0.0, *env.scene.arena_m)
 
 
 def actors(env: Env) -> tuple[Actor, ...]:
     """Who and what takes part in the scenario, in the order of the world's bodies."""
-    names, config = env.spec.robots, env.config
-    if isinstance(config, SkirmishConfig):
-        n = len(names)
-        labels = (*names, *(f"opponent_{j + 1}" for j in range(len(config.opponents))))
-        return tuple(
-            Actor(name, placed.unit, Side(int(i >= n)), unit.radius_m)
-            for i, (name, placed, unit) in enumerate(
-                zip(labels, config.placed, config.units, strict=True)
-            )
-        )
+    if env.scene.actors:
+        return env.scene.actors
     robots = tuple(
         Actor(name, "robot", Side.ROBOTS, radius)
-        for name, radius in zip(names, env.scene.radii_m, strict=True)
+        for name, radius in zip(env.spec.robots, env.scene.radii_m, strict=True)
     )
     boxes = tuple(
         Actor(f"box_{k + 1}", "box", Side.THINGS, 0.0, size_m)
@@ -205,18 +169,7 @@ def actors(env: Env) -> tuple[Actor, ...]:
 
 def vitals(env: Env, arena: int) -> tuple[FloatArray, FloatArray]:
     """(d,) health and (d,) shield of the scenario's actors, as shares of the full ones."""
-    config = env.config
-    if not isinstance(config, SkirmishConfig):
-        d = env.world.bodies.shape[1]
-        return np.ones(d, dtype=np.float32), np.zeros(d, dtype=np.float32)
-    layout = config.layout
-    parts = layout.split_state(env.state[arena])
-    robots, opponents = parts.robots, parts.opponents
-    health = (robots[:, STATE_HEALTH], opponents[:, STATE_OPPONENT_HEALTH])
-    shield = (
-        robots[:, STATE_SHIELD] if layout.robot_shields else np.zeros(layout.n_robots),
-        opponents[:, STATE_OPPONENT_SHIELD]
-        if layout.opponent_shields
-        else np.zeros(layout.n_opponents),
-    )
-    return np.concatenate(health), np.concatenate(shield).astype(np.float32)
+    if env.scene.vitals is not None:
+        return env.scene.vitals(env.state[arena])
+    d = env.world.bodies.shape[1]
+    return np.ones(d, dtype=np.float32), np.zeros(d, dtype=np.float32)

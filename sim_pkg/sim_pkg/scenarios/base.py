@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Annotated, Any, Protocol
 
 import numpy as np
@@ -29,9 +30,35 @@ class PhysicsConfig(StrictModel):
     iterations: int = Field(ge=1, le=1000)
 
 
+class Side(IntEnum):
+    """Whose a body is."""
+
+    ROBOTS = 0
+    OPPONENTS = 1
+    THINGS = 2
+
+
+@dataclass(frozen=True)
+class Actor:
+    """One body of an episode; a disc, or where it has a size, a box of (width, height)."""
+
+    name: str
+    kind: str
+    side: Side
+    radius_m: float
+    size_m: tuple[float, float] | None = None
+
+
+Vitals = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+"""(S,) state -> (d,) health and (d,) shield of the actors, as shares of the full ones."""
+
+
 @dataclass(frozen=True)
 class Scene:
-    """What can be drawn of a scenario; metres."""
+    """What can be drawn of a scenario; metres.
+
+    ``actors`` stand in the order of the World's bodies; empty: the robots, then the boxes.
+    """
 
     arena_m: tuple[float, float]  # width, height; the south-west corner is (0, 0)
     cell_m: float  # side of a grid cell; 0: no grid
@@ -41,6 +68,9 @@ class Scene:
     site_radius_m: float = 0.0  # of a round site; 0: a site is a cell
     boxes_m: tuple[tuple[float, float], ...] = ()  # width, height of each of the World's boxes
     rough_m: tuple[tuple[float, float, float, float], ...] = ()  # x1, y1, x2, y2 of rough floor
+    walled_m: tuple[float, float, float, float] | None = None  # the part between walls; None: all
+    actors: tuple[Actor, ...] = ()
+    vitals: Vitals | None = None  # None: nobody can be hurt
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from crash_coach_common.contract import BoolArray, EnvSpec, IntArray
-from sim_pkg.scenarios.base import Buffers, Kind, Scene, episode_rng, robot_names
+from crash_coach_common.contract import BoolArray, EnvSpec, FloatArray, IntArray
+from sim_pkg.scenarios.base import Actor, Buffers, Kind, Scene, Side, episode_rng, robot_names
 from sim_pkg.scenarios.skirmish import brake, combat, observe, orders
 from sim_pkg.scenarios.skirmish.config import PHASES, TICK_S, SkirmishConfig
-from sim_pkg.scenarios.skirmish.layout import NO_OP, STOP
+from sim_pkg.scenarios.skirmish.layout import (
+    NO_OP,
+    STATE_HEALTH,
+    STATE_OPPONENT_HEALTH,
+    STATE_OPPONENT_SHIELD,
+    STATE_SHIELD,
+    STOP,
+)
 from sim_pkg.scenarios.skirmish.tables import ALIVE, Fight, Tables
 from sim_pkg.world import DiscSpec, Float64Array, World, WorldSpec
 
@@ -72,8 +79,24 @@ class Skirmish:
             cell_m=0.0,
             radii_m=tuple(unit.radius_m for unit in config.units[: self._n]),
             sites_m=(),
+            walled_m=config.free_m,
+            actors=_actors(config, self.spec.robots),
+            vitals=self._vitals,
         )
         self.world = _world(config)
+
+    def _vitals(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
+        layout = self.layout
+        parts = layout.split_state(state)
+        robots, opponents = parts.robots, parts.opponents
+        health = (robots[:, STATE_HEALTH], opponents[:, STATE_OPPONENT_HEALTH])
+        shield = (
+            robots[:, STATE_SHIELD] if layout.robot_shields else np.zeros(layout.n_robots),
+            opponents[:, STATE_OPPONENT_SHIELD]
+            if layout.opponent_shields
+            else np.zeros(layout.n_opponents),
+        )
+        return np.concatenate(health), np.concatenate(shield).astype(np.float32)
 
     def begin(self, arena: int, seed: int, episode: int) -> Float64Array:
         """All whole and at their starts."""
@@ -131,6 +154,16 @@ class Skirmish:
             for arena, disc in np.argwhere(self._inside & ~alive & running[:, None]).tolist():
                 world.take_out(arena, disc)
             self._inside &= alive
+
+
+def _actors(config: SkirmishConfig, robots: tuple[str, ...]) -> tuple[Actor, ...]:
+    names = (*robots, *(f"opponent_{j + 1}" for j in range(len(config.opponents))))
+    return tuple(
+        Actor(name, placed.unit, Side(int(i >= len(robots))), unit.radius_m)
+        for i, (name, placed, unit) in enumerate(
+            zip(names, config.placed, config.units, strict=True)
+        )
+    )
 
 
 def _world(config: SkirmishConfig) -> WorldSpec:

@@ -1,0 +1,64 @@
+"""What other packages add by name, through entry points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, TypeVar
+
+from crash_coach_common.contract import UserError
+
+T = TypeVar("T")
+
+
+def load(point: EntryPoint) -> Any:
+    """What it names. Raises UserError naming it and its package where that cannot be had."""
+    try:
+        return point.load()
+    except (ImportError, AttributeError) as error:
+        raise UserError(f"{place(point)} cannot be loaded: {error}") from error
+
+
+def place(point: EntryPoint) -> str:
+    package = point.dist.name if point.dist is not None else "an unknown package"
+    return f"entry point {point.name} = {point.value} ({point.group}) of {package}"
+
+
+class Plugins(Mapping[str, T]):
+    """Ours, then those of an entry point group, which are looked for once and loaded when used.
+
+    Args:
+        own: by name; these names cannot be taken.
+        check: raises ValueError where what was loaded under a name cannot be used.
+    """
+
+    def __init__(self, group: str, own: Mapping[str, T], check: Callable[[str, Any], None]) -> None:
+        self.group, self._own, self._check = group, dict(own), check
+        self._points: dict[str, EntryPoint] | None = None
+
+    def _installed(self) -> dict[str, EntryPoint]:
+        if self._points is None:
+            self._points = {
+                point.name: point
+                for point in entry_points(group=self.group)
+                if point.name not in self._own
+            }
+        return self._points
+
+    def __getitem__(self, name: str) -> T:
+        """Raises KeyError; UserError for an entry point that cannot be used."""
+        if name not in self._own:
+            point = self._installed()[name]
+            loaded = load(point)
+            try:
+                self._check(name, loaded)
+            except ValueError as error:
+                raise UserError(f"{place(point)} cannot be used: {error}") from error
+            self._own[name] = loaded
+        return self._own[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(dict.fromkeys((*self._own, *self._installed())))
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))

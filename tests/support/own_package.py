@@ -1,0 +1,92 @@
+"""A package from outside the repository: a scenario kind, a coaching strategy and a fault mode."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+SOURCE = '''
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from crash_coach_pkg.faults.base import CommandFault, FaultParameters
+from sim_pkg.scenarios.base import Kind
+from sim_pkg.scenarios.buttons import Buttons, ButtonsConfig
+
+
+class PatrolConfig(ButtonsConfig):
+    kind: Literal["patrol"]
+    reward_company: float
+
+
+class Patrol(Buttons):
+    """Buttons, and a reward for every step in which two robots share a cell."""
+
+    def settle(self, running, world, out):
+        super().settle(running, world, out)
+        cells = np.floor(world.bodies[:, : self.spec.n_robots, :2] / self.config.cell_m)
+        together = (cells[:, 0] == cells[:, 1]).all(axis=-1)
+        out.reward[running & together] += self.config.reward_company
+
+
+KIND = Kind(PatrolConfig, Patrol)
+
+
+class Steady:
+    """A rate that follows the number of episodes."""
+
+    initial_rate = 0.25
+    needs_success = False
+
+    def next_rate(self, rate, success_rate, progress):
+        return 0.5 if progress.episodes else 0.25
+
+
+def steady(config):
+    return Steady()
+
+
+class LimpParameters(FaultParameters):
+    every: int = Field(
+        default=2,
+        ge=1,
+        le=100,
+        description="Every so many commands one is lost.",
+        json_schema_extra={"unit": "commands"},
+    )
+
+
+class Limp(CommandFault):
+    name = "limp"
+    code = 201
+    summary = "Every few commands one is lost."
+    Parameters = LimpParameters
+
+    def __init__(self, parameters):
+        super().__init__(parameters)
+        self._count = 0
+
+    def apply(self, step, command, last, tools):
+        self._count += 1
+        return None if self._count % self.parameters.every == 0 else command
+'''
+POINTS = """
+[crash_coach.scenarios]
+patrol = own:KIND
+
+[crash_coach.strategies]
+steady = own:steady
+
+[crash_coach.faults]
+limp = own:Limp
+"""
+
+
+def install(site: Path, source: str = SOURCE, points: str = POINTS) -> None:
+    """What installing the package leaves in ``site``: its module, and what its metadata says."""
+    info = site / "own_robots-1.0.dist-info"
+    info.mkdir(parents=True)
+    (site / "own.py").write_text(source)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: own-robots\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(points)
