@@ -8,6 +8,7 @@ a busy machine disturbs less.
 from __future__ import annotations
 
 import json
+import os
 import statistics
 import time
 from typing import Any
@@ -17,6 +18,7 @@ import torch
 
 from benchmarks.padded_learner import PaddedLearner, PaddedReplay
 from policy_pkg.episode import Episode, Sizes
+from policy_pkg.learner import native
 from policy_pkg.learner.config import LearnerConfig
 from policy_pkg.learner.learner import Learner
 from policy_pkg.learner.replay import Replay
@@ -83,11 +85,43 @@ def _step_row(name: str, sizes: Sizes, full_lengths: bool, target: float | None)
     }
 
 
+def _kernel_row(name: str, sizes: Sizes, target: float) -> Row:
+    """The gradient step with the compiled unroll against the same one with numpy's, in turn."""
+    rng = np.random.default_rng(0)
+    replay, learner = Replay(STORED_EPISODES, sizes), Learner(LearnerConfig(), sizes, seed=0)
+    for steps in rng.integers(1, sizes.episode_limit + 1, STORED_EPISODES).tolist():
+        replay.add(random_episode(sizes, rng, steps))
+    compiled, before = native.build_name(), os.environ.get(native.VARIABLE)
+    seconds: dict[str, list[float]] = {compiled or native.NUMPY: [], native.NUMPY: []}
+    for repeat in range(100 if sizes is BUTTONS else 25):
+        batch = replay.gather(rng.choice(STORED_EPISODES, BATCH_EPISODES, replace=False))
+        for kernel, spent in seconds.items():
+            os.environ[native.VARIABLE] = kernel
+            start = time.process_time()
+            learner.update(batch, episodes=0)
+            if repeat >= 2:
+                spent.append(time.process_time() - start)
+    os.environ.pop(native.VARIABLE)
+    if before is not None:
+        os.environ[native.VARIABLE] = before
+    plain = 1e3 * statistics.median(seconds[native.NUMPY])
+    ours = 1e3 * statistics.median(seconds[compiled or native.NUMPY])
+    return {
+        "name": name,
+        "value": round(ours, 2),
+        "unit": "ms",
+        "reference": round(plain, 2),
+        "ratio": round(plain / ours, 2),
+        "target": f">= {target}x",
+        "ok": plain / ours >= target,
+    }
+
+
 def _replay_row() -> Row:
     """Bound of 5,000 combat episodes, against the sizes of its arrays by hand."""
     row_bytes = 8 * 128 * 4 + 216 * 4 + 8 * 14  # float32 observations and state, byte masks
     step_bytes = 8 * 4 + 4 + 8  # int32 actions, float32 reward, byte faults
-    stated = 5000 * (61 * row_bytes + 60 * step_bytes + 9)
+    stated = 5000 * (61 * row_bytes + 60 * step_bytes + 18)
     bound = Replay(5000, COMBAT).nbytes_bound
     return {
         "name": "replay memory, 5000 episodes at most",
@@ -109,6 +143,8 @@ def rows() -> list[Row]:
             _step_row("gradient step, real length mix", COMBAT, False, 1.7),
             _step_row("gradient step, full lengths", COMBAT, True, 1.0),
             _step_row("gradient step, buttons", BUTTONS, False, None),
+            _kernel_row("gradient step, kernel to numpy", COMBAT, 1.0),
+            _kernel_row("the same, buttons", BUTTONS, 1.0),
             _replay_row(),
         ]
     finally:

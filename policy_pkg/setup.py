@@ -13,6 +13,7 @@ setup(
         "policy_pkg",
         "policy_pkg.bags",
         "policy_pkg.learner",
+        "policy_pkg.learner.native",
         "policy_pkg.play",
         "policy_pkg.report",
         "policy_pkg.ros",
@@ -22,7 +23,7 @@ setup(
         "policy_pkg.train.live",
         "policy_pkg.train.offline",
     ],
-    package_data={"policy_pkg": ["configs/**/*.yaml", "ros/*.xml"]},
+    package_data={"policy_pkg": ["configs/**/*.yaml", "ros/*.xml", "learner/native/*.cpp"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
         (f"share/{package}", ["package.xml"]),

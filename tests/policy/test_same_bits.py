@@ -15,6 +15,7 @@ from small_run import small
 
 from policy_pkg.checkpoint import find_checkpoint
 from policy_pkg.kernels import kernels
+from policy_pkg.learner.native import NUMPY, VARIABLE, build_name
 
 NO_AVX512 = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
 TRAIN = """
@@ -74,8 +75,9 @@ def test_training_has_the_same_bits_on_other_processors(tmp_path: Path, numba: b
     target = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CACHE_DIR": str(tmp_path / "numba")}
     config = small(explore_hold=6, replay_strata="outcome", learner={"td_lambda": 0.8}, n_envs=8)
     machines = {
-        "this": machine(),
+        "this": machine(**{VARIABLE: build_name() or NUMPY}),
         "older": machine(
+            **{VARIABLE: "avx2"},
             NPY_DISABLE_CPU_FEATURES=disabled(),
             ATEN_CPU_CAPABILITY="avx2",
             **(target if numba else {}),
@@ -88,7 +90,7 @@ def test_training_has_the_same_bits_on_other_processors(tmp_path: Path, numba: b
         metrics = (tmp_path / name / "metrics.jsonl").read_bytes()
         found[name] = hashlib.sha256(agent.read_bytes() + metrics).hexdigest()
         described = json.loads((tmp_path / name / "run.json").read_text())
-        assert described["kernels"] == {"openblas": "Haswell"}
+        assert described["kernels"] == {"openblas": "Haswell", "unroll": env[VARIABLE]}
     assert found["this"] == found["older"]
 
 

@@ -1,4 +1,8 @@
-"""The agent net, Linear - ReLU - GRU - Linear, shared by all robots, over a packed batch."""
+"""The agent net, Linear - ReLU - GRU - Linear, shared by all robots, over a packed batch.
+
+In float32 by the compiled kernel where set-up built it (``native``), else by numpy: the same within
+rounding, and the path that tests compare gradients of in float64.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,7 @@ import numpy.typing as npt
 from numba import njit
 
 from policy_pkg.episode import Sizes
-from policy_pkg.learner import packed_gru
+from policy_pkg.learner import native, packed_gru
 from policy_pkg.learner.flat_parameters import Shapes, linear
 from policy_pkg.learner.packed_gru import Gates, GruWeights, Schedule
 
@@ -45,14 +49,24 @@ class Tape:
 
 def values(params: Params, inputs: Array, schedule: Schedule) -> Array:
     """Action values (R, A) of the packed rows ``inputs`` (R, I)."""
+    if kernel := _kernel(inputs):
+        return kernel.forward(params, inputs, schedule.sizes, keep=False)[0]
     hidden, _, _ = _unroll(params, inputs, schedule, keep=False)
     return _output(params, hidden)
 
 
-def values_and_tape(params: Params, inputs: Array, schedule: Schedule) -> tuple[Array, Tape]:
+def values_and_tape(
+    params: Params, inputs: Array, schedule: Schedule
+) -> tuple[Array, Tape | native.Tape]:
     """As ``values``, with what ``gradients`` needs."""
+    if kernel := _kernel(inputs):
+        return kernel.forward(params, inputs, schedule.sizes, keep=True)
     hidden, embedded, gates = _unroll(params, inputs, schedule, keep=True)
     return _output(params, hidden), Tape(inputs, schedule, embedded, gates, hidden)
+
+
+def _kernel(inputs: Array) -> native.Unroll | None:
+    return native.unroll() if inputs.dtype == np.float32 else None
 
 
 def _output(params: Params, hidden: Array) -> Array:
@@ -86,11 +100,16 @@ def _unroll(
     return hidden, embedded, gates
 
 
-def gradients(params: Params, tape: Tape, grad_q: Array, out: Params) -> None:
+def gradients(params: Params, tape: Tape | native.Tape, grad_q: Array, out: Params) -> None:
     """Backward of ``values_and_tape``: fills the parameters' gradients ``out``, by name.
 
     grad_q: (R, A) of the loss with respect to the action values.
     """
+    if isinstance(tape, native.Tape):
+        kernel = native.unroll()
+        assert kernel is not None  # it made the tape
+        kernel.backward(params, tape, grad_q, out)
+        return
     w_ih, w_hh, fc2_w = params["rnn.weight_ih"], params["rnn.weight_hh"], params["fc2.weight"]
     schedule, hidden, embedded, gates = tape.schedule, tape.hidden, tape.embedded, tape.gates
     size, most = hidden.shape[1], schedule.sizes[0]

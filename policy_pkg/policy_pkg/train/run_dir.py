@@ -28,6 +28,7 @@ from typing import Any
 from crash_coach_common.contract import UserError
 from policy_pkg.checkpoint import CHECKPOINTS
 from policy_pkg.kernels import kernels
+from policy_pkg.learner import native
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.offline.config import OfflineConfig
 
@@ -105,7 +106,7 @@ def describe_run(config: RunConfig, data: dict[str, Any] | None = None) -> dict[
             **{name: version(name) for name in LIBRARIES},
         },
         "machine": platform.machine(),
-        "kernels": kernels(),
+        "kernels": {**kernels(), "unroll": native.build_name() or native.NUMPY},
         "commit": _commit(),
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
     }
