@@ -150,6 +150,66 @@ def _student_within(t: float, freedom: int) -> float:
     return 2 / math.pi * (angle + (math.sin(angle) * total if freedom > 1 else 0.0))
 
 
+def paired_p_value(differences: npt.NDArray[np.float64]) -> float:
+    """Two-sided p that the mean difference over seeds is zero: Student's t.
+
+    Where all are equal t knows no spread: then the share of sign flips that give a mean as large,
+    2^(1 - seeds), or 1 where all are zero.
+
+    Args:
+        differences: (seeds,), at least two.
+
+    Raises:
+        ValueError: fewer.
+    """
+    count = differences.size
+    if count < 2:
+        raise ValueError(f"{count} difference: a test over seeds needs two")
+    error = float(differences.std(ddof=1)) / math.sqrt(count)
+    mean = abs(float(differences.mean()))
+    if error <= 1e-12:
+        return 1.0 if mean <= 1e-12 else 2.0 ** (1 - count)
+    return max(0.0, 1.0 - _student_within(mean / error, count - 1))
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """The p values of one family of tests, adjusted for how many they are (Holm 1979)."""
+    count = len(p_values)
+    adjusted, highest = [1.0] * count, 0.0
+    for rank, index in enumerate(sorted(range(count), key=lambda i: p_values[i])):
+        highest = max(highest, min(1.0, (count - rank) * p_values[index]))
+        adjusted[index] = highest
+    return adjusted
+
+
+def performance_profile(
+    scores: Sequence[npt.NDArray[np.float64]],
+    thresholds: npt.NDArray[np.float64],
+    rng: np.random.Generator,
+    resamples: int = 2000,
+    confidence: float = 0.95,
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Share of runs that score more than each threshold (Agarwal et al. 2021), a mean over tasks.
+
+    Args:
+        scores: of each task (seeds,).
+        thresholds: (T,).
+
+    Returns:
+        (T,) the share and the bounds of a stratified percentile bootstrap, at each threshold.
+    """
+    value = np.zeros(len(thresholds))
+    drawn = np.zeros((resamples, len(thresholds)))
+    for task in scores:
+        value += np.mean(task[:, None] > thresholds, axis=0) / len(scores)
+        chosen = _resample(task, rng, resamples)
+        for index, threshold in enumerate(thresholds):
+            drawn[:, index] += np.mean(chosen > threshold, axis=1) / len(scores)
+    tail = (1 - confidence) / 2
+    low, high = np.quantile(drawn, [tail, 1 - tail], axis=0)
+    return value, low, high
+
+
 def interquartile_mean(scores: npt.NDArray[np.float64]) -> float:
     """Mean of the middle half of all scores, whole and fractional (Agarwal et al. 2021).
 

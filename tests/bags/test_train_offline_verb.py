@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 from collections.abc import Callable
 from dataclasses import replace
@@ -158,6 +159,10 @@ def test_wrong_arguments_are_one_line(refused: Refused, tmp_path: Path, bags: li
     assert "nowhere" in refused("offline/qmix", tmp_path / "nowhere", *out)
     line = refused("buttons/qmix", bags[0], *out)
     assert "no training config 'buttons/qmix'" in line
+    shutil.copytree(bags[0], tmp_path / "copy")
+    line = refused("offline/qmix", bags[0], tmp_path / "copy", *out, *QUICK)
+    assert "episodes repeat another one (same seed, number and content)" in line
+    assert "name it once, or give --repeated" in line
     line = refused("offline/qmix", bags[0], *out, "--seed", "1", "1")
     assert "--seed 1 1: a seed comes twice" in line
     line = refused("offline/qmix", bags[0], *out, "--set", "episode_numbers=[7, 9]")

@@ -88,7 +88,7 @@ def test_conditions_in_order() -> None:
 
 
 def test_without_a_crash_option_it_is_crash_free() -> None:
-    (found,) = conditions(ROBOTS, [], [], [], "stay", {})
+    (found,) = conditions(ROBOTS, [], [], [], "mute", {})
     assert found.crash.strategy == "none"
 
 
@@ -100,13 +100,17 @@ def test_without_a_crash_option_it_is_crash_free() -> None:
         ([], [3], [], "--crashed 3"),
         ([], [-1], [], "--crashed -1"),
         ([], [], ["robot_9"], "robot_9"),
+        ([], [], ["robot_1", "robot_1"], "--victims: robot_1 is given twice"),
+        ([0.1, 0.1], [], [], "--crash-rate: 0.1 is given twice"),
+        ([], [1, 0, 1], [], "--crashed: 1 is given twice"),
+        ([], [], [], "--mode random: nobody crashes; say who, such as --crashed 1"),
     ],
 )
 def test_wrong_conditions_are_named(
     rates: list[float], crashed: list[int], victims: list[str], names: str
 ) -> None:
     with pytest.raises(CliError, match=names):
-        conditions(ROBOTS, rates, crashed, victims, "stay", {})
+        conditions(ROBOTS, rates, crashed, victims, "random", {})
 
 
 @pytest.mark.parametrize(
@@ -180,7 +184,7 @@ def test_evaluate_tells_what_each_robot_costs(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     free, *alone = json.loads(out.read_text())["conditions"]
     robots = [f"robot_{i + 1}" for i in range(len(alone))]
-    assert [c["name"] for c in alone] == [f"{robot} stay" for robot in robots]
+    assert [c["name"] for c in alone] == [f"{robot} mute" for robot in robots]
     assert "cost" not in free
     for condition in alone:
         assert condition["cost"] == free["success_rate"] - condition["success_rate"]
@@ -188,12 +192,12 @@ def test_evaluate_tells_what_each_robot_costs(tmp_path: Path) -> None:
         assert low <= condition["cost"] <= high
     # Those first that cost most; robots that cost the same in their order.
     costs = {condition["name"]: -condition["cost"] for condition in alone}
-    shown = [line.split("│")[1].strip() for line in done.stdout.splitlines() if " stay " in line]
+    shown = [line.split("│")[1].strip() for line in done.stdout.splitlines() if " mute " in line]
     assert shown == sorted(costs, key=costs.__getitem__)
     # A single condition is held against the crash-free one as well.
     typed(*team, "--episodes", "4", "--victims", "robot_1", "--json", str(out))
     assert [c["name"] for c in json.loads(out.read_text())["conditions"]] == [
-        "crash-free", "robot_1 stay",
+        "crash-free", "robot_1 mute",
     ]  # fmt: skip
 
 

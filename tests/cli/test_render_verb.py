@@ -20,7 +20,7 @@ from crash_coach_bringup.cli.main import main
 from crash_coach_bringup.cli.verbs import calibrate
 from crash_coach_bringup.ros.probe import find_executable
 from policy_pkg.play.conditions import exactly, named
-from policy_pkg.play.evaluate import Scripted, evaluate, record
+from policy_pkg.play.evaluate import Scripted, evaluate, evaluation_seed, record
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 from sim_pkg.render.frames import Frames
@@ -48,7 +48,8 @@ def test_it_draws_the_episode_that_evaluate_plays(tmp_path: Path) -> None:
     assert "crashed: robot_2" in text
     assert out.read_bytes().startswith(b"GIF8")
     told = json.loads(report.read_text())
-    played = evaluate(Scripted("random"), "buttons", named(["robot_2"], "stay"), 3, 4).episodes[2]
+    key = evaluation_seed(4)
+    played = evaluate(Scripted("random"), "buttons", named(["robot_2"]), 3, key).episodes[2]
     assert told["trajectory_hash"] == played.trajectory_hash
     assert (told["steps"], told["crashed"]) == (played.steps, [1])
     assert sorted(p.name for p in tmp_path.iterdir()) == ["film.gif", "film.json"]
@@ -166,7 +167,8 @@ def test_calibrate_counts_wins_and_losses(tmp_path: Path) -> None:
         3,
         0,
     )
-    played = evaluate(Scripted("random"), "skirmish/3m", exactly(1, "stay"), 8, 0).summary()
+    key = evaluation_seed(0)
+    played = evaluate(Scripted("random"), "skirmish/3m", exactly(1), 8, key).summary()
     for name in ("success_rate", "success_ci95", "steps_mean", "return_mean"):
         assert rows[1][name] == pytest.approx(played[name])
     assert rows[4]["robots_lost_mean"] == 0

@@ -214,7 +214,7 @@ def test_unfinished_runs_and_uneven_lengths_are_named(tmp_path: Path) -> None:
             ["crash-free", "1 crashed", "2 crashed", "rate 0.01", "rate 0.05", "rate 0.1",
              "robot_1 mute", "robot_2 mute"],
         ),
-        ([1, 0, 1], None, None, ["1 crashed", "crash-free"]),
+        ([1, 0], None, None, ["1 crashed", "crash-free"]),
         (None, [0.3], None, ["rate 0.3"]),
         ([1], None, True, ["crash-free", "1 crashed", "robot_1 mute", "robot_2 mute"]),
         ([0], [0.3], True, ["crash-free", "rate 0.3", "robot_1 mute", "robot_2 mute"]),

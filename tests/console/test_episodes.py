@@ -26,11 +26,12 @@ from crash_coach_console.player import CHUNK, Player
 from crash_coach_console.recording import Recording
 from crash_coach_console.requests import Inject, Request, parse_request
 from policy_pkg.play.conditions import crash_free, named
-from policy_pkg.play.evaluate import Scripted, evaluate
+from policy_pkg.play.evaluate import Scripted, evaluate, evaluation_seed
 from policy_pkg.play.target import load_target
 
 WAIT_S = 30.0
 SCENARIO, KITE = "skirmish/3s_vs_5z", "scripted:kite"
+KEY = evaluation_seed(4)
 
 
 def inject(*victims: str, mode: str = "mute", **fields: Any) -> Inject:
@@ -44,7 +45,7 @@ def player() -> Player:
 
 def test_a_run_plays_the_episodes_that_evaluate_plays(player: Player) -> None:
     film = player.choose(2)
-    result = evaluate(Scripted("kite"), SCENARIO, crash_free(), range(2, 3), 4).episodes[0]
+    result = evaluate(Scripted("kite"), SCENARIO, crash_free(), range(2, 3), KEY).episodes[0]
     assert film.frames.trajectory_hash == result.trajectory_hash
     assert (film.played.success, film.played.steps) == (result.success, result.steps)
     assert film.stretches == []
@@ -66,7 +67,7 @@ def test_the_same_episode_goes_otherwise_from_the_crash_on(player: Player) -> No
     assert last[2] == crashed.frames.intents[10, 1]
     assert last[3:] == [-1, "mute"]
     after = player.after(crashed)
-    result = evaluate(Scripted("kite"), SCENARIO, named(["robot_2"]), range(3, 4), 4).episodes[0]
+    result = evaluate(Scripted("kite"), SCENARIO, named(["robot_2"]), range(3, 4), KEY).episodes[0]
     assert after.frames.trajectory_hash == result.trajectory_hash
     both, _ = player.crash(after, inject("robot_1"), after.frames.steps)
     assert both.begin == 0
@@ -100,7 +101,7 @@ def test_costs_are_those_of_evaluate() -> None:
         found += player.more()
         time.sleep(0.01)
     for crash, condition in (((), crash_free()), (("robot_1",), named(["robot_1"]))):
-        wanted = evaluate(Scripted("kite"), SCENARIO, condition, range(CHUNK), 4).episodes
+        wanted = evaluate(Scripted("kite"), SCENARIO, condition, range(CHUNK), KEY).episodes
         shown = [played for played in found if played.crashed == crash][:CHUNK]
         assert [(p.episode, p.success, p.episode_return) for p in shown] == [
             (r.episode, r.success, r.episode_return) for r in wanted

@@ -15,8 +15,9 @@ from policy_pkg.episode import Sizes
 from policy_pkg.learner.config import LearnerConfig
 from policy_pkg.learner.learner import Learner
 from policy_pkg.play.conditions import Condition, at_rate, crash_free, exactly, named
-from policy_pkg.play.evaluate import Evaluation, Scripted, evaluate, record
+from policy_pkg.play.evaluate import Evaluation, Scripted, evaluate, evaluation_seed, record
 from policy_pkg.policy import RecurrentPolicy
+from policy_pkg.train.config import TrainConfig
 from sim_pkg.env import make_env
 
 SCENARIO = "buttons"
@@ -145,6 +146,21 @@ def test_episodes_that_are_all_one_are_told(policy: RecurrentPolicy) -> None:
     assert run.summary()["success_ci95"] is None
     assert not evaluate(policy, SCENARIO, crash_free(), 1, 5).alike
     assert not evaluate(Scripted("random"), SCENARIO, crash_free(), 6, 5).alike
+
+
+def test_no_training_has_played_the_episodes_of_an_evaluation(policy: RecurrentPolicy) -> None:
+    highest = TrainConfig.model_validate({"scenario": SCENARIO, "seed": 2**62 - 1}).seed
+    assert evaluation_seed(0) > highest
+    assert evaluation_seed(2**62 - 1) == 2**63 - 1  # as much as a ROS parameter holds
+    assert len({evaluation_seed(seed) for seed in range(100)}) == 100
+    for seed in (-1, 2**62):
+        with pytest.raises(UserError, match=f"seed {seed}: "):
+            evaluation_seed(seed)
+    drawn = [
+        [e.crashed for e in evaluate(policy, SCENARIO, at_rate(0.4), 40, key).episodes]
+        for key in (0, evaluation_seed(0))
+    ]
+    assert drawn[0] != drawn[1]
 
 
 def test_a_policy_of_another_team_is_refused(policy: RecurrentPolicy) -> None:

@@ -25,6 +25,21 @@ from sim_pkg.render.frames import Frames, Recorder
 from sim_pkg.scripted import make_scripted
 from sim_pkg.trajectory import CourseHash, TrajectoryHash, combine
 
+EVALUATION = 1 << 62  # beyond every seed of a training, and so of its blocks
+
+
+def evaluation_seed(seed: int) -> int:
+    """What keys the episodes of an evaluation with ``seed``: none that a training has played.
+
+    Trainings are keyed by their seed as it is, their evaluation blocks by another one below 2^62.
+
+    Raises:
+        UserError: a seed that is negative, or 2^62 or more.
+    """
+    if not 0 <= seed < EVALUATION:
+        raise UserError(f"seed {seed}: a number from 0 to 2^62 - 1 is needed for an evaluation")
+    return seed | EVALUATION
+
 
 @dataclass(frozen=True)
 class EpisodeResult:

@@ -12,13 +12,14 @@ from typing import Any
 
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.play.conditions import Condition
-from policy_pkg.play.evaluate import evaluate
+from policy_pkg.play.evaluate import evaluate, evaluation_seed
 from policy_pkg.report.finished_runs import Run
+from policy_pkg.report.training import Training, training_of
 from policy_pkg.statistics import Estimate, wilson
 from policy_pkg.train.run_dir import RunError
 from sim_pkg.env import make_env
 
-FORMAT = 2  # of what is kept; a new number makes everything be played again
+FORMAT = 3  # of what is kept; a new number makes everything be played again
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,7 @@ class Result:
 
     run: Run
     outcomes: Sequence[tuple[Condition, Outcome]]
+    training: Training
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ class Evaluations:
             UserError: the checkpoint or a condition does not fit, or a kept file is damaged.
             OSError: the folder cannot be written.
         """
-        path = self.folder / f"{run.path.resolve().name}.json"
+        path = self._path(run)
         kept = _read(path)
         outcomes = []
         for condition in conditions:
@@ -98,7 +100,19 @@ class Evaluations:
                 _write(path, kept)
             figures = {k: v for k, v in kept[key].items() if k != "condition"}
             outcomes.append((condition, Outcome(**figures)))
-        return Result(run, outcomes)
+        return Result(run, outcomes, training_of(run))
+
+    def lacking(self, run: Run, conditions: Sequence[Condition]) -> int:
+        """How many of the conditions are still to be played.
+
+        Raises:
+            RunError: a kept file is damaged.
+        """
+        kept = _read(self._path(run))
+        return sum(self._key(run, condition) not in kept for condition in conditions)
+
+    def _path(self, run: Run) -> Path:
+        return self.folder / f"{run.path.resolve().name}.json"
 
     def _key(self, run: Run, condition: Condition) -> str:
         about = {
@@ -113,7 +127,8 @@ class Evaluations:
 
     def _play(self, run: Run, condition: Condition) -> Outcome:
         bundle = load_policy(run.checkpoint)
-        found = evaluate(bundle, run.scenario, condition, self.episodes, self.seed)
+        key = evaluation_seed(self.seed)
+        found = evaluate(bundle, run.scenario, condition, self.episodes, key)
         figures = found.summary()
         return Outcome(
             successes=sum(episode.success for episode in found.episodes),

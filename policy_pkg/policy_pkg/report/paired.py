@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from policy_pkg.report.rows import ALL_MAPS, Row
-from policy_pkg.statistics import Estimate, mean_interval
+from policy_pkg.statistics import Estimate, holm, mean_interval, paired_p_value
 
 LEAST_PAIRS = 2  # for an interval
 
@@ -18,7 +18,8 @@ class PairedDifference:
     """How much higher the success rate of ``method`` is than that of ``against``.
 
     ``values``: of each seed that both have; over all maps, of each seed the mean of the maps.
-    ``interval``: their mean, Student's t, 95 %.
+    ``interval``: their mean, Student's t, 95 %. ``p``: of a mean of zero, corrected by Holm for
+    all comparisons under this condition.
     """
 
     scenario: str
@@ -28,6 +29,7 @@ class PairedDifference:
     seeds: tuple[int, ...]
     values: tuple[float, ...]
     interval: Estimate
+    p: float
 
 
 def paired_differences(found: Sequence[Row], against: Sequence[str]) -> list[PairedDifference]:
@@ -50,8 +52,9 @@ def paired_differences(found: Sequence[Row], against: Sequence[str]) -> list[Pai
         for method in methods
         if method not in chosen[: place + 1]
     ]
-    out = []
+    out: list[PairedDifference] = []
     for condition in dict.fromkeys(row.condition for row in found):
+        family = []
         for method, other in compared:
             pairs = {
                 name: _of_each_seed(
@@ -66,7 +69,10 @@ def paired_differences(found: Sequence[Row], against: Sequence[str]) -> list[Pai
                     seeds, values = tuple(of_seeds), tuple(of_seeds.values())
                     interval = mean_interval(np.array(values))
                     place = (name, condition, method, other)
-                    out.append(PairedDifference(*place, seeds, values, interval))
+                    p = paired_p_value(np.array(values))
+                    family.append(PairedDifference(*place, seeds, values, interval, p))
+        corrected = holm([each.p for each in family])
+        out += [replace(each, p=p) for each, p in zip(family, corrected, strict=True)]
     return out
 
 

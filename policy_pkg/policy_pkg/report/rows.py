@@ -11,12 +11,14 @@ import numpy.typing as npt
 
 from policy_pkg.report.finished_runs import methods_of
 from policy_pkg.report.kept_evaluations import Result, arena
+from policy_pkg.report.training import LAST_BLOCKS
 from policy_pkg.statistics import (
     Estimate,
     binomial_weights,
     bootstrap_interquartile_mean,
     mean_interval,
     mean_of,
+    performance_profile,
     probability_of_improvement,
     reweighted_success,
     wilson,
@@ -25,6 +27,7 @@ from policy_pkg.statistics import (
 ALL_MAPS = "all maps"
 WORST_VICTIM = "worst victim"
 Scores = npt.NDArray[np.float64]
+THRESHOLDS = np.linspace(0.0, 1.0, 51)
 LEAST_SEEDS = 3  # of either method and map, for a probability of improvement
 
 
@@ -80,11 +83,27 @@ class Improvement:
     estimate: Estimate
 
 
+@dataclass(frozen=True)
+class Profile:
+    """Performance profile: the share of a method's runs with a success rate above each threshold.
+
+    ``share``, ``low``, ``high``: at THRESHOLDS; 95 %.
+    """
+
+    condition: str
+    method: str
+    scenarios: tuple[str, ...]
+    share: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+
 def rows(results: Sequence[Result], rates: Sequence[float]) -> list[Row]:
     """A row per map, condition and method; then those over all maps, where there are several.
 
     Behind the conditions that were played come those that follow from them: the rates, the mean
-    over exact numbers of crashed robots, and each run's worst victim.
+    over exact numbers of crashed robots, and each run's worst victim; and, as a single checkpoint
+    says little about a run that goes up and down, the mean of its own last evaluation blocks.
 
     Args:
         results: of all runs, with the same conditions on the same map; their order is that of
@@ -107,7 +126,7 @@ def rows(results: Sequence[Result], rates: Sequence[float]) -> list[Row]:
             found += [_measured(group, index) for group in methods.values()]
         for rate in rates:
             found += [_reweighted(group, rate) for group in methods.values()]
-        for summary in (_mean_over_crashed, _worst_victim):
+        for summary in (_mean_over_crashed, _worst_victim, _last_blocks):
             found += [row for group in methods.values() if (row := summary(group)) is not None]
     return found + _over_maps(found, tuple(groups))
 
@@ -171,6 +190,15 @@ def _worst_victim(group: Sequence[Result]) -> Row | None:
             return None
         single.append(min(victims, key=lambda estimate: estimate.value))
     return _row(group, WORST_VICTIM, single)
+
+
+def _last_blocks(group: Sequence[Result]) -> Row | None:
+    """Each run's last blocks without crashes; None where one has too few, or acts otherwise."""
+    means = [r.training.last_blocks for r in group if not r.run.is_best]
+    single = [Estimate(mean, mean, mean) for mean in means if mean is not None]
+    if len(single) < len(group):
+        return None
+    return _row(group, f"crash-free, last {LAST_BLOCKS} blocks", single)
 
 
 def _row(
@@ -258,6 +286,23 @@ def improvements(found: Sequence[Row]) -> list[Improvement]:
                     _draws(),
                 )
                 out.append(Improvement(condition, better, worse, tuple(shared), estimate))
+    return out
+
+
+def profiles(found: Sequence[Row]) -> list[Profile]:
+    """Of every method under each condition that was played, but for single victims.
+
+    Over the maps on which it has at least LEAST_SEEDS; the same rows as for ``improvements``.
+    """
+    scores: dict[tuple[str, str], dict[str, Scores]] = {}
+    for row in found:
+        if row.returns and not row.victim and len(row.seeds) >= LEAST_SEEDS:
+            scores.setdefault((row.condition, row.method), {})[row.scenario] = np.array(row.success)
+    out = []
+    for (condition, method), maps in scores.items():
+        bounds = performance_profile(list(maps.values()), THRESHOLDS, _draws())
+        share, low, high = (tuple(values.tolist()) for values in bounds)
+        out.append(Profile(condition, method, tuple(maps), share, low, high))
     return out
 
 

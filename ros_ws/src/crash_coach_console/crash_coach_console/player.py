@@ -22,7 +22,7 @@ from crash_coach_pkg.coach.injection import describe
 from crash_coach_pkg.faults import check_parameters
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.play.conditions import Condition
-from policy_pkg.play.evaluate import Evaluation, Scripted, evaluate, record
+from policy_pkg.play.evaluate import Evaluation, Scripted, evaluate, evaluation_seed, record
 from policy_pkg.play.target import Target
 from sim_pkg.env import make_env
 
@@ -42,13 +42,16 @@ class _Tally:
 
 
 class Player:
-    """Episodes of ``seed``. Raises ConfigError for a scenario that cannot be played."""
+    """Episodes that `crash-coach evaluate` plays with ``seed``.
+
+    Raises ConfigError for a scenario that cannot be played.
+    """
 
     kind: Kind = "episodes"
 
     def __init__(self, target: Target, seed: int = 0) -> None:
         self._target = target
-        self._seed = seed
+        self._seed = evaluation_seed(seed)
         self._team = target.team
         self._scenario = target.scenario
         spec = make_env(self._scenario, 1).spec

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from typing import Annotated
 
@@ -12,6 +13,7 @@ from crash_coach_common.contract import UserError
 from crash_coach_pkg.faults import check_parameters, fault_mode
 from policy_pkg.play.conditions import Condition, at_rate, crash_free, exactly, named
 
+MODE = "mute"  # unless told otherwise
 CrashedOption = Annotated[
     list[int] | None, typer.Option(help="K ...: exactly K robots crash, drawn anew each episode.")
 ]
@@ -56,25 +58,6 @@ def mode_parameters(mode: str, given: list[str]) -> dict[str, float]:
     return parameters
 
 
-def with_each_robot(
-    asked: list[Condition],
-    robots: tuple[str, ...],
-    each_robot: bool,
-    mode: str,
-    parameters: Mapping[str, float],
-) -> list[Condition]:
-    """``asked``, with every robot alone if so wanted, and behind the crash-free condition, which
-    tells what the others cost."""
-    found = asked
-    if each_robot:
-        alone = [named([robot], mode, parameters) for robot in robots]
-        # Without another crash option all that was asked for is crash-free.
-        found = [*asked, *(c for c in alone if c not in asked)]
-    if any(condition.crashed == 0 for condition in found):
-        return found
-    return [crash_free(), *found]
-
-
 def conditions(
     robots: tuple[str, ...],
     rates: list[float],
@@ -82,14 +65,42 @@ def conditions(
     victims: list[str],
     mode: str,
     parameters: Mapping[str, float],
+    each_robot: bool | None = None,
 ) -> list[Condition]:
-    """What to evaluate under, in the order rates, counts, victims; crash-free without any.
+    """What to evaluate under, in the order rates, counts, victims, each robot; crash-free without.
 
-    ``parameters``: of the mode, as ``mode_parameters`` returns them.
+    Args:
+        parameters: of the mode, as ``mode_parameters`` returns them.
+        each_robot: also each robot alone. None: where the conditions are no evaluation's;
+            otherwise crash-free comes first, which tells what the others cost.
 
     Raises:
         CliError: names the option, its value and what would be right.
     """
+    _check(robots, rates, crashed, victims)
+    if not (rates or crashed or victims or each_robot) and (mode != MODE or parameters):
+        raise CliError(
+            f"--mode {mode}: nobody crashes; say who, such as --crashed 1 or --victims {robots[0]}"
+        )
+    out = [at_rate(rate, mode, parameters) for rate in rates]
+    out += [exactly(count, mode, parameters) for count in crashed]
+    if victims:
+        out.append(named(victims, mode, parameters))
+    if each_robot:
+        alone = [named([robot], mode, parameters) for robot in robots]
+        out += [condition for condition in alone if condition not in out]
+    if each_robot is not None and not any(condition.crashed == 0 for condition in out):
+        return [crash_free(), *out]
+    return out or [crash_free()]
+
+
+def _check(
+    robots: tuple[str, ...], rates: list[float], crashed: list[int], victims: list[str]
+) -> None:
+    """Raises CliError for a wrong value, or one that is there twice."""
+    for option, values in (("crash-rate", rates), ("crashed", crashed), ("victims", victims)):
+        if twice := [value for value, count in Counter(values).items() if count > 1]:
+            raise CliError(f"--{option}: {twice[0]} is given twice")
     for rate in rates:
         if not 0 <= rate <= 1:
             raise CliError(f"--crash-rate {rate}: a probability from 0 to 1 is needed")
@@ -99,8 +110,3 @@ def conditions(
     for name in victims:
         if name not in robots:
             raise CliError(f"--victims {name}: unknown robot; one of: {', '.join(robots)}")
-    out = [at_rate(rate, mode, parameters) for rate in rates]
-    out += [exactly(count, mode, parameters) for count in crashed]
-    if victims:
-        out.append(named(list(dict.fromkeys(victims)), mode, parameters))
-    return out or [crash_free()]

@@ -11,7 +11,7 @@ from crash_coach_pkg.coach.config import TeamSpec
 from crash_coach_pkg.coach.fault_scenario import FaultScenario, ScenarioPlanner
 from crash_coach_pkg.faults.action_tools import ACTION_OFFERS
 from policy_pkg.play.conditions import Planned, crash_free
-from policy_pkg.play.evaluate import Evaluation, Scripted, evaluate
+from policy_pkg.play.evaluate import Evaluation, Scripted, evaluate, evaluation_seed
 from policy_pkg.play.target import Target
 from policy_pkg.report.verdict import FaultRun, judge_run
 from sim_pkg.env import make_env
@@ -45,6 +45,7 @@ def play(
     if via is Via.ros and scripted:
         raise CliError(f"--via ros: {target.name} has no nodes; scripted teams play in the core")
     spec = check_scenario(faults, target.scenario, values=not scripted)
+    seed = evaluation_seed(seed)
     planner = ScenarioPlanner(faults, TeamSpec.of(spec), seed)
     if via is Via.ros:
         faulted, free = _play_via_ros(faults, target, episodes, seed, layout)

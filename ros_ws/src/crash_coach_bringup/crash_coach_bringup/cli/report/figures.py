@@ -12,32 +12,27 @@ from matplotlib.lines import Line2D
 from crash_coach_bringup.cli.output import CliError
 from crash_coach_bringup.cli.picture import TeamResults, draw_first_episodes
 from crash_coach_bringup.cli.report.curves import learning_curves
+from crash_coach_bringup.cli.report.findings import Findings
 from crash_coach_bringup.cli.report.panels import COLUMNS, legend_above, panels
 from crash_coach_bringup.cli.report.success import in_recordings, success
 from crash_coach_bringup.cli.report.victims import victims
 from crash_coach_bringup.cli.verbs.plot import COLOURS, FORMATS, INK, save, style
 from policy_pkg.checkpoint import load_policy
-from policy_pkg.play.evaluate import evaluate
+from policy_pkg.play.evaluate import evaluate, evaluation_seed
 from policy_pkg.report.finished_runs import Run, methods_of
 from policy_pkg.report.kept_evaluations import Result
-from policy_pkg.report.rows import ALL_MAPS, Improvement, Row
-from policy_pkg.report.victims import Cost
+from policy_pkg.report.rows import ALL_MAPS, THRESHOLDS, Improvement, Profile, Row
 
 APART = 0.06  # between the methods' points at the same number of crashed robots
 
 
-def write(
-    rows: Sequence[Row],
-    better: Sequence[Improvement],
-    costs: Sequence[Cost],
-    runs: Sequence[Run],
-    out: Path,
-) -> list[Path]:
-    """Draws what rows and runs suffice for, as PNG and SVG; returns the files.
+def write(findings: Findings, runs: Sequence[Run], out: Path) -> list[Path]:
+    """Draws what was found suffices for, as PNG and SVG; returns the files.
 
     Raises:
         CliError: a file cannot be written.
     """
+    rows, better, costs = findings.rows, findings.improvements, findings.costs
     exact = [row for row in rows if row.crashed is not None and row.scenario != ALL_MAPS]
     # One order, and so one colour per method, in all figures.
     methods = methods_of(runs)
@@ -52,6 +47,8 @@ def write(
         figures["curves"] = curves
     if better:
         figures["improvement"] = improvement(better)
+    if findings.profiles:
+        figures["profile"] = profile(findings.profiles, methods)
     files = []
     for name, figure in figures.items():
         for kind in FORMATS:
@@ -130,6 +127,39 @@ def improvement(better: Sequence[Improvement]) -> Figure:
     return figure
 
 
+def profile(found: Sequence[Profile], methods: Sequence[str]) -> Figure:
+    """A panel per condition: which share of each method's runs scores more than a success rate."""
+    conditions = list(dict.fromkeys(each.condition for each in found))
+    figure, axes = panels(len(conditions), width=3.2, height=2.8)
+    for ax, condition in zip(axes, conditions, strict=True):
+        for each in found:
+            if each.condition == condition:
+                colour, dash = style(methods.index(each.method))
+                ax.step(THRESHOLDS, each.share, dash, where="post", color=colour, linewidth=1.5)
+                ax.fill_between(
+                    *(THRESHOLDS, each.low, each.high),
+                    step="post",
+                    color=colour,
+                    alpha=0.15,
+                    linewidth=0,
+                )
+        ax.set_xlim(0, 1)
+        ax.set_ylim(-0.03, 1.03)
+        ax.set_title(condition, fontsize=10, color=INK)
+        ax.set_xlabel("success rate", color=INK)
+        ax.set_ylabel("share of runs above", color=INK)
+    legend_above(
+        figure,
+        [
+            Line2D([], [], color=style(i)[0], linestyle=style(i)[1], label=name)
+            for i, name in enumerate(methods)
+        ],
+    )
+    text = "performance profile over seeds and maps; band: 95 % stratified bootstrap"
+    figure.supxlabel(text, fontsize=8, color=INK)
+    return figure
+
+
 def trajectories(results: Sequence[Result], run_seed: int, seed: int, out: Path) -> Path:
     """A panel per condition with the first episode of every method's run ``run_seed``.
 
@@ -146,7 +176,8 @@ def trajectories(results: Sequence[Result], run_seed: int, seed: int, out: Path)
     for result in chosen:
         bundle = load_policy(result.run.checkpoint)
         scenario = result.run.scenario
-        first = [(c, evaluate(bundle, scenario, c, 1, seed)) for c, _ in result.outcomes]
+        key = evaluation_seed(seed)
+        first = [(c, evaluate(bundle, scenario, c, 1, key)) for c, _ in result.outcomes]
         colour, _ = style(methods.index(result.run.method))
         teams.append(TeamResults(result.run.method, colour, bundle, first))
     path = out / "trajectories.png"

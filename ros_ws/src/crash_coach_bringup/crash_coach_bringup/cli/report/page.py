@@ -6,12 +6,21 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from crash_coach_bringup.cli.markdown import table
+from crash_coach_bringup.cli.report.findings import Findings
 from policy_pkg.report.paired import LEAST_PAIRS, PairedDifference
-from policy_pkg.report.rows import ALL_MAPS, Row, best
+from policy_pkg.report.rows import ALL_MAPS, Improvement, Row, best
 from policy_pkg.report.victims import Cost
 from policy_pkg.statistics import Estimate
 
 NONE = "–"
+IMPROVEMENT = (
+    "How probable it is that a run of the first method succeeds more often than one of the second "
+    "(equal ones count half), over the maps that both have at least three seeds on; 95 % bootstrap."
+)
+RUNS = (
+    "Success in %, and after the comma the mean return. Evaluation episodes are those of a run's "
+    "own blocks: as much a part of what a method costs as its training episodes."
+)
 VICTIMS = (
     "Success in % with this robot alone crashed and, in brackets, what that costs: how much lower "
     "it is than crash-free, in points; ± half the width of its 95 % interval. Who costs most, on "
@@ -19,36 +28,36 @@ VICTIMS = (
 )
 
 
-def page(
-    about: Mapping[str, Any],
-    rows: Sequence[Row],
-    paired: Sequence[PairedDifference],
-    costs: Sequence[Cost],
-    runs: Sequence[Mapping[str, Any]],
-    differences: Sequence[str],
-) -> str:
-    """``about``: episodes, seed, mode, against, runs without_checkpoint; ``runs``: as
-    ``report.describe`` gives them; ``differences``: in training between the maps."""
+def page(findings: Findings) -> str:
+    """All tables, and what a reader of them has to know."""
+    about, rows, runs = findings.about, findings.rows, findings.runs
     mode = about["mode"]
     if about["parameters"]:
         values = ", ".join(f"{name} = {value:g}" for name, value in about["parameters"].items())
         mode += f" ({values})"
     parts = [
         f"Success in % of {about['episodes']} greedy episodes per run and condition (evaluation "
-        f"seed {about['seed']}, the same episodes for every run; crashed robots: {mode}). "
-        + _checkpoints(runs),
+        f"seed {about['seed']}, the same episodes for every run, which no training has played; "
+        f"crashed robots: {mode}). " + _checkpoints(runs),
     ]
     if len({row.method for row in rows}) > 1:
         parts += ["## Methods", "Mean ± sample standard deviation over seeds; best in bold."]
-        parts += _overview(rows)
-    if costs:
-        parts += ["## Who hurts most", VICTIMS, *_victims(costs)]
+        for name, columns, lines in overview(rows):
+            parts += [f"### {name}", table(["method", *columns], lines)]
+    if findings.costs:
+        parts += ["## Who hurts most", VICTIMS, *_victims(findings.costs)]
     if about["against"]:
-        parts += ["## Differences", *_differences(paired)]
+        parts += ["## Differences", *_differences(findings.paired)]
+    if findings.improvements:
+        parts += [
+            "## Probability of improvement",
+            IMPROVEMENT,
+            _improvements(findings.improvements),
+        ]
     parts += ["## Intervals", _meaning(rows), _details(rows)]
-    parts += ["## Runs", "Success in %, and after the comma the mean return.", _runs(runs)]
+    parts += ["## Runs", RUNS, _runs(runs)]
     waiting = [f"{path} has no checkpoint yet: left out." for path in about["without_checkpoint"]]
-    parts += [f"- {note}" for note in (*waiting, *notes(rows, runs), *differences)]
+    parts += [f"- {note}" for note in (*waiting, *notes(rows, runs), *findings.differences)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -76,22 +85,24 @@ def span(estimate: Estimate | None) -> str:
     return NONE if estimate is None else f"{figure(estimate.low)}..{figure(estimate.high)}"
 
 
-def _overview(rows: Sequence[Row]) -> list[str]:
-    """As the paper has it: a table per map, methods down, conditions across."""
+def overview(rows: Sequence[Row]) -> list[tuple[str, list[str], list[list[str]]]]:
+    """As the paper has it: of each map its name, the conditions and a line of cells per method.
+
+    Victims, which have a table of their own, are not among the conditions.
+    """
     bold = best(rows)
-    maps: dict[str, dict[str, dict[str, str]]] = {}  # map -> method -> condition -> cell
-    for row in rows:
-        text = percent(row)
-        if (row.scenario, row.condition, row.method) in bold:
-            text = f"**{text}**"
-        maps.setdefault(row.scenario, {}).setdefault(row.method, {})[row.condition] = text
     out = []
-    for name, methods in maps.items():
-        # Victims have a table of their own.
+    for name in dict.fromkeys(row.scenario for row in rows):
         here = [row for row in rows if row.scenario == name and not row.victim]
         conditions = list(dict.fromkeys(row.condition for row in here))
+        methods: dict[str, dict[str, str]] = {}
+        for row in here:
+            text = percent(row)
+            if (row.scenario, row.condition, row.method) in bold:
+                text = f"**{text}**"
+            methods.setdefault(row.method, {})[row.condition] = text
         lines = [[m, *(cells.get(c, NONE) for c in conditions)] for m, cells in methods.items()]
-        out += [f"### {name}", table(["method", *conditions], lines)]
+        out.append((name, conditions, lines))
     return out
 
 
@@ -101,8 +112,8 @@ def _differences(paired: Sequence[PairedDifference]) -> list[str]:
         return [f"None: no two methods have {LEAST_PAIRS} seeds in common on a map."]
     maps = list(dict.fromkeys(each.scenario for each in paired))
     out = [
-        "In percentage points, of runs with the same seed: mean and Student's t interval (95 %), "
-        "without a correction for how many there are."
+        "In percentage points, of runs with the same seed: mean and Student's t interval (95 %); p "
+        "of a mean of zero, corrected by Holm for all comparisons of a table (below 0.05 in bold)."
     ]
     for condition in dict.fromkeys(each.condition for each in paired):
         lines: dict[str, dict[str, str]] = {}
@@ -110,6 +121,8 @@ def _differences(paired: Sequence[PairedDifference]) -> list[str]:
             if each.condition == condition:
                 middle, half = each.interval.value, each.interval.high - each.interval.value
                 text = f"{round(100 * middle, 9):+.1f} ± {figure(half)}".replace("-", "−")
+                p = f"p = {each.p:.2g}" if each.p >= 0.001 else "p < 0.001"
+                text += f", **{p}**" if each.p < 0.05 else f", {p}"
                 lines.setdefault(f"{each.method} − {each.against}", {})[each.scenario] = text
         cells = [[pair, *(of.get(name, NONE) for name in maps)] for pair, of in lines.items()]
         out += [f"### {condition}", table(["difference", *maps], cells)]
@@ -132,6 +145,18 @@ def _victims(costs: Sequence[Cost]) -> list[str]:
         lines = [[v, *(cells.get(m, NONE) for m in methods)] for v, cells in victims.items()]
         out += [f"### {name}", table(["crashed", *methods], lines)]
     return out
+
+
+def _improvements(better: Sequence[Improvement]) -> str:
+    """Pairs of methods down, conditions across."""
+    conditions = list(dict.fromkeys(each.condition for each in better))
+    pairs: dict[str, dict[str, str]] = {}
+    for each in better:
+        estimate = each.estimate
+        text = f"{estimate.value:.2f} ({estimate.low:.2f}..{estimate.high:.2f})"
+        pairs.setdefault(f"{each.better} over {each.worse}", {})[each.condition] = text
+    lines = [[pair, *(cells.get(c, NONE) for c in conditions)] for pair, cells in pairs.items()]
+    return table(["pair", *conditions], lines)
 
 
 def _meaning(rows: Sequence[Row]) -> str:
@@ -173,12 +198,22 @@ def _runs(runs: Sequence[Mapping[str, Any]]) -> str:
     lines = []
     for run in runs:
         alpha = NONE if run["new_alpha"] is None else f"{run['new_alpha']:.2f}"
+        learned, played = run["training_episodes"], run["evaluation_episodes"]
+        episodes = NONE if learned is None else f"{learned:,} + {played:,}"
         updates = NONE if run["gradient_steps"] is None else f"{run['gradient_steps']:,}"
         cells = [_outcome(run["outcomes"].get(name)) for name in names]
         acts = f"{run['checkpoint']}, {run['checkpoint_steps']:,}"
-        head = (run["scenario"], run["method"], run["seed"], f"{run['steps']:,}", acts, updates)
+        head = (
+            run["scenario"],
+            run["method"],
+            run["seed"],
+            f"{run['steps']:,}",
+            acts,
+            episodes,
+            updates,
+        )
         lines.append([*head, _minutes(run["wall_s"]), alpha, *cells])
-    columns = ["map", "method", "seed", "steps", "checkpoint"]
+    columns = ["map", "method", "seed", "steps", "checkpoint", "episodes: training + evaluation"]
     columns += ["gradient steps", "wall time", "α at the end"]
     return table([*columns, *names], lines)
 

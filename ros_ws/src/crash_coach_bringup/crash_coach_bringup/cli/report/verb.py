@@ -3,31 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from crash_coach_bringup.cli.options import ModeOption, ParamOption, conditions, mode_parameters
+from crash_coach_bringup.cli.options import (
+    MODE,
+    ModeOption,
+    ParamOption,
+    conditions,
+    mode_parameters,
+)
 from crash_coach_bringup.cli.output import CliError, console, write_json
+from crash_coach_bringup.cli.report.findings import Findings
+from crash_coach_bringup.cli.report.other_tables import as_csv, as_latex
 from crash_coach_bringup.cli.report.page import page
+from crash_coach_bringup.cli.report.time_left import TimeLeft
 from crash_coach_bringup.cli.verbs.evaluate import MOST_EPISODES
 from policy_pkg.play.conditions import Condition, crash_free, named
+from policy_pkg.play.evaluate import evaluation_seed
 from policy_pkg.report.finished_runs import (
     Run,
-    differences,
     find_runs,
     has_begun,
-    last_metrics,
     methods_of,
     read_runs,
-    wall_time_s,
 )
 from policy_pkg.report.kept_evaluations import Evaluations, Result, arena
-from policy_pkg.report.paired import paired_differences
-from policy_pkg.report.rows import Row, improvements, rows
-from policy_pkg.report.victims import costs
+from policy_pkg.report.marl_eval import as_marl_eval
 
 CRASHED = (0, 1, 2)
 RATES = (0.01, 0.05, 0.1)
@@ -50,7 +55,7 @@ def asked(
         each_robot = each_robot is None
     elif each_robot and 0 not in (crashed or []):
         crashed = [0, *(crashed or [])]
-    counts, drawn = list(dict.fromkeys(crashed or [])), list(dict.fromkeys(rates or []))
+    counts, drawn = list(crashed or []), list(rates or [])
     if not counts and not drawn:
         found = []
     else:
@@ -96,6 +101,21 @@ AgainstOption = Annotated[
 ]
 
 
+CsvOption = Annotated[bool, typer.Option("--csv", help="Also table.csv, a line per row.")]
+LatexOption = Annotated[
+    bool, typer.Option("--latex", help="Also table.tex, the methods' table for booktabs.")
+]
+
+
+@dataclass(frozen=True)
+class Extra:
+    """What is written only if asked for; ``trajectories``: of the runs with that seed."""
+
+    csv: bool
+    latex: bool
+    trajectories: int | None
+
+
 def report(
     folders: FoldersArgument = None,
     out: Annotated[
@@ -107,11 +127,13 @@ def report(
     crashed: CrashedOption = None,
     crash_rate: RateOption = None,
     each_robot: EachRobotOption = None,
-    mode: ModeOption = "mute",
+    mode: ModeOption = MODE,
     param: ParamOption = None,
     seed: Annotated[int, typer.Option(help="Of the episodes, the same for every run.", min=0)] = 0,
     against: AgainstOption = None,
     trajectories: TrajectoriesOption = None,
+    csv: CsvOption = False,
+    latex: LatexOption = False,
 ) -> None:
     """Compares methods over seeds: evaluates many runs alike.
 
@@ -131,6 +153,7 @@ def report(
     about = {
         "episodes": episodes,
         "seed": seed,
+        "key": evaluation_seed(seed),
         "mode": mode,
         "parameters": parameters,
         "against": against or [],
@@ -139,8 +162,8 @@ def report(
     try:
         out.mkdir(parents=True, exist_ok=True)
         results = _play(runs, wanted, Evaluations(out / "evaluations", episodes, seed))
-        found = rows(results, list(dict.fromkeys(rates)) if exact else [])
-        _write(out, about, found, results, trajectories)
+        findings = Findings.of(about, results, list(rates) if exact else [])
+        _write(out, findings, results, Extra(csv, latex, trajectories))
     except OSError as error:
         raise CliError(f"--out {out}: {error.strerror}: {error.filename}") from error
 
@@ -164,68 +187,42 @@ def _check_methods(against: Sequence[str], runs: Sequence[Run]) -> None:
 def _play(
     runs: Sequence[Run], wanted: Mapping[str, Sequence[Condition]], evaluations: Evaluations
 ) -> list[Result]:
+    """Plays what is not kept; says what, how far it is, and how long the rest will take."""
+    total = sum(evaluations.lacking(run, wanted[run.scenario]) for run in runs)
+    clock = TimeLeft(total)
+
     results = []
     for run in runs:
 
         def say(condition: Condition, run: Run = run) -> None:
             best = " (best)" if run.is_best else ""
-            text = f"{run.path}{best} on {run.scenario}: {condition.name}"
+            text = f"{clock.next()} {run.path}{best} on {run.scenario}: {condition.name}"
             console.print(text, markup=False, highlight=False, soft_wrap=True)
 
         results.append(evaluations.result(run, wanted[run.scenario], say))
     return results
 
 
-def describe(result: Result) -> dict[str, Any]:
-    """A run in figures, JSON values; null where its directory does not tell."""
-    run, metrics = result.run, last_metrics(result.run.path)
-    return {
-        "run": str(run.path),
-        "scenario": run.scenario,
-        "method": run.method,
-        "seed": run.seed,
-        "steps": run.steps,
-        "checkpoint": "best" if run.is_best else "last",
-        "checkpoint_steps": run.checkpoint_steps,
-        "total_steps": run.total_steps,
-        "settings": run.settings,
-        "gradient_steps": metrics.get("gradient_steps"),
-        "new_alpha": metrics.get("new_alpha"),
-        "wall_s": wall_time_s(run.path),
-        "victims": {c.name: c.victim for c, _ in result.outcomes if c.victim},
-        "outcomes": {condition.name: asdict(outcome) for condition, outcome in result.outcomes},
-    }
-
-
-def _write(
-    out: Path,
-    about: Mapping[str, Any],
-    found: Sequence[Row],
-    results: Sequence[Result],
-    run_seed: int | None,
-) -> None:
-    """Tables, JSON and figures; ``run_seed``: whose trajectories are drawn, if any."""
-    better = improvements(found)
-    described = [describe(result) for result in results]
-    paired = paired_differences(found, about["against"])
-    cost = costs(found)
-    text = page(about, found, paired, cost, described, differences([each.run for each in results]))
-    (out / "table.md").write_text(text, encoding="utf-8")
-    content = {
-        **about,
-        "rows": [asdict(row) for row in found],
-        "paired_differences": [asdict(each) for each in paired],
-        "costs": [asdict(each) for each in cost],
-        "improvements": [asdict(each) for each in better],
-        "runs": described,
-    }
-    write_json(out / "results.json", content)
+def _write(out: Path, findings: Findings, results: Sequence[Result], extra: Extra) -> None:
+    """Tables, JSON and figures."""
+    text = page(findings)
+    tables = {"table.md": text}
+    if extra.csv:
+        tables["table.csv"] = as_csv(findings.rows)
+    if extra.latex:
+        tables["table.tex"] = as_latex(findings.rows)
+    for name, content in tables.items():
+        (out / name).write_text(content, encoding="utf-8")
+    write_json(out / "results.json", findings.to_json())
+    write_json(out / "marl_eval.json", as_marl_eval(results))
     # Imported here: no other verb should wait for matplotlib.
     from crash_coach_bringup.cli.report import figures as report_figures
 
-    drawn = report_figures.write(found, better, cost, [each.run for each in results], out)
-    if run_seed is not None:
-        drawn.append(report_figures.trajectories(results, run_seed, about["seed"], out))
+    drawn = report_figures.write(findings, [result.run for result in results], out)
+    if extra.trajectories is not None:
+        seeds = extra.trajectories, findings.about["seed"]
+        drawn.append(report_figures.trajectories(results, *seeds, out))
     console.print(text, markup=False, highlight=False, soft_wrap=True)
-    for path in (out / "table.md", out / "results.json", *drawn):
+    written = (out / name for name in (*tables, "results.json", "marl_eval.json"))
+    for path in (*written, *drawn):
         console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)

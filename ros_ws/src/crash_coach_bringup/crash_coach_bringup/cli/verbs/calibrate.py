@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from crash_coach_bringup.cli.options import (
+    MODE,
     CrashedOption,
     ModeOption,
     ParamOption,
@@ -26,7 +27,7 @@ from crash_coach_bringup.cli.output import (
 )
 from crash_coach_bringup.cli.verbs.evaluate import MOST_EPISODES
 from policy_pkg.play.conditions import Condition
-from policy_pkg.play.evaluate import Scripted, record
+from policy_pkg.play.evaluate import Scripted, evaluation_seed, record
 from policy_pkg.statistics import wilson
 from sim_pkg.env import make_env
 from sim_pkg.render.frames import Frames, Side
@@ -79,7 +80,7 @@ def tally(policy: str, scenario: str, condition: Condition, episodes: int, seed:
     out = Tally(drawn=condition.drawn)
     for first in range(0, episodes, AT_ONCE):
         some = range(first, min(first + AT_ONCE, episodes))
-        for frames in record(Scripted(policy), scenario, condition, some, seed):
+        for frames in record(Scripted(policy), scenario, condition, some, evaluation_seed(seed)):
             out.count(frames)
     return out
 
@@ -142,7 +143,7 @@ def calibrate(
         list[str] | None, typer.Option(help="NAME ...: these; default: all that play it.")
     ] = None,
     crashed: CrashedOption = None,
-    mode: ModeOption = "stay",
+    mode: ModeOption = MODE,
     param: ParamOption = None,
     episodes: Annotated[
         int, typer.Option(help="Episodes of each.", min=1, max=MOST_EPISODES)

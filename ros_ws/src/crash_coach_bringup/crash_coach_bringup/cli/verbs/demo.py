@@ -13,7 +13,7 @@ from crash_coach_bringup.cli.output import console, percent_ci, table, write_jso
 from crash_coach_bringup.cli.verbs.evaluate import ALIKE, Layout, as_json
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.play.conditions import Condition, crash_free, named
-from policy_pkg.play.evaluate import Evaluation
+from policy_pkg.play.evaluate import Evaluation, evaluation_seed
 from policy_pkg.train.config import load_train_config
 
 METHODS = {"qmix": "buttons/demo_qmix", "adaptive": "buttons/demo_adaptive"}
@@ -52,7 +52,7 @@ def run_graphs(out: Path, episodes: int, seed: int, layout: Layout) -> Results:
                 bundle.scenario,
                 condition,
                 episodes,
-                seed,
+                evaluation_seed(seed),
                 layout.value,
             )
             results.setdefault(method, []).append((condition, result))

@@ -10,12 +10,12 @@ from typing import Annotated, Any
 import typer
 
 from crash_coach_bringup.cli.options import (
+    MODE,
     CrashedOption,
     ModeOption,
     ParamOption,
     conditions,
     mode_parameters,
-    with_each_robot,
 )
 from crash_coach_bringup.cli.output import (
     CliError,
@@ -27,7 +27,7 @@ from crash_coach_bringup.cli.output import (
     write_json,
 )
 from policy_pkg.play.conditions import Condition
-from policy_pkg.play.evaluate import Evaluation, Scripted
+from policy_pkg.play.evaluate import Evaluation, Scripted, evaluation_seed
 from policy_pkg.play.evaluate_processes import evaluate_on
 from policy_pkg.play.target import HELP, Target, load_target
 from policy_pkg.statistics import Estimate, difference
@@ -174,7 +174,7 @@ def evaluate(
         list[str] | None, typer.Option(help="ROBOT ...: all of these robots, in every episode.")
     ] = None,
     each_robot: EachRobotOption = False,
-    mode: ModeOption = "stay",
+    mode: ModeOption = MODE,
     param: ParamOption = None,
     processes: ProcessesOption = 1,
     via: ViaOption = Via.core,
@@ -194,9 +194,8 @@ def evaluate(
     target = load_target(team, scenario)
     name = target.scenario
     who = crash_rate or [], crashed or [], victims or []
-    asked = conditions(target.robots, *who, mode, parameters)
-    asked = with_each_robot(asked, target.robots, each_robot, mode, parameters)
-    played = play(target, asked, episodes, seed, processes, via, layout)
+    asked = conditions(target.robots, *who, mode, parameters, each_robot=each_robot)
+    played = play(target, asked, episodes, evaluation_seed(seed), processes, via, layout)
     results = list(zip(asked, played, strict=True))
     show(f"{team} on {name}: {episodes} episodes each, seed {seed}, via {via}", results)
     summaries = as_json(results)
@@ -204,5 +203,6 @@ def evaluate(
     console.print(f"trajectory hash {trajectory_hash}", soft_wrap=True)
     result: dict[str, Any] = {"team": team, "scenario": name, "via": via.value}
     result["layout"] = layout.value if via is Via.ros else None
-    result |= {"seed": seed, "episodes": episodes, "mode": mode, "parameters": parameters}
+    result |= {"seed": seed, "key": evaluation_seed(seed), "episodes": episodes}
+    result |= {"mode": mode, "parameters": parameters}
     write_json(json, {**result, "trajectory_hash": trajectory_hash, "conditions": summaries})

@@ -8,7 +8,13 @@ from typing import Annotated, Any
 
 import typer
 
-from crash_coach_bringup.cli.options import ModeOption, ParamOption, conditions, mode_parameters
+from crash_coach_bringup.cli.options import (
+    MODE,
+    ModeOption,
+    ParamOption,
+    conditions,
+    mode_parameters,
+)
 from crash_coach_bringup.cli.output import (
     CliError,
     check_file_target,
@@ -20,7 +26,7 @@ from crash_coach_common.strict_yaml import ConfigError
 from policy_pkg.bags.bag import is_recording
 from policy_pkg.bags.playback import play_back, read_episode
 from policy_pkg.play.conditions import Condition
-from policy_pkg.play.evaluate import record
+from policy_pkg.play.evaluate import evaluation_seed, record
 from policy_pkg.play.target import HELP, load_target
 from sim_pkg.render.frames import Frames
 
@@ -126,7 +132,7 @@ def render(
     ] = None,
     crashed: Annotated[int | None, typer.Option(help="So many robots crash, drawn.")] = None,
     victims: Annotated[list[str] | None, typer.Option(help="ROBOT ...: these robots.")] = None,
-    mode: ModeOption = "stay",
+    mode: ModeOption = MODE,
     param: ParamOption = None,
     speed: Annotated[float, typer.Option(help="Of a film, times real time.")] = 1.0,
     json: Annotated[Path | None, typer.Option(help="Also write what happened here.")] = None,
@@ -147,13 +153,13 @@ def render(
         parameters = mode_parameters(mode, param or [])
         target = load_target(team, scenario)
         condition = one_condition(target.robots, crash_rate, crashed, victims, mode, parameters)
-        first = episode or 0
-        (frames,) = record(target.team, target.scenario, condition, range(first, first + 1), seed)
+        one = range(episode or 0, (episode or 0) + 1)
+        (frames,) = record(target.team, target.scenario, condition, one, evaluation_seed(seed))
         crash = condition.crash.model_dump(mode="json")
-        which = {"team": team, "condition": condition.name, "crash": crash}
+        which = {"team": team, "condition": condition.name, "crash": crash, "seed": seed}
     draw(frames, out, speed)
     show(frames, out)
-    write_json(json, {**which, **outcome(frames), "file": str(out)})
+    write_json(json, {**outcome(frames), **which, "file": str(out)})
 
 
 def refuse_options_of_a_team(context: typer.Context) -> None:

@@ -78,17 +78,27 @@ def train_offline(
     strict: Annotated[
         bool, typer.Option("--strict", help="Refuse recordings with any problem.")
     ] = False,
+    repeated: Annotated[
+        bool,
+        typer.Option("--repeated", help="Take episodes that are recorded twice as often as that."),
+    ] = False,
 ) -> None:
     """Trains a team on recorded episodes, without a simulator. Recordings are read once."""
-    train_runs(plan_runs(config, out, override or [], seed or []), bags, resume, strict)
+    runs = plan_runs(config, out, override or [], seed or [])
+    train_runs(runs, bags, resume, strict, repeated)
 
 
 def train_runs(
-    runs: Mapping[Path, OfflineConfig], bags: Sequence[Path], resume: bool, strict: bool
+    runs: Mapping[Path, OfflineConfig],
+    bags: Sequence[Path],
+    resume: bool,
+    strict: bool,
+    repeated: bool,
 ) -> None:
     """One run after another, whose configs differ in nothing but the seed.
 
     Raises:
+        CliError: an episode that is there twice, unless ``repeated``.
         UserError: as ``policy_pkg.train.offline.run``.
     """
     # Imported here: the other verbs do without torch.
@@ -98,6 +108,11 @@ def train_runs(
     with Progress(*columns, TextColumn("{task.fields[figures]}"), console=console) as bars:
         tasks = {run: bars.add_task(run.name, total=1.0, figures="waiting") for run in runs}
         data = offline.read_data(next(iter(runs.values())), load_episodes(bags, strict, _tell))
+        if data.duplicates and not repeated:
+            raise CliError(
+                f"{data.duplicates} of {len(data)} episodes repeat another one (same seed, number "
+                "and content): a recording is named twice; name it once, or give --repeated"
+            )
         for run, settings in runs.items():
             summary = offline.train_offline(
                 settings,

@@ -1,0 +1,71 @@
+"""What a run's own record tells of its training: its last blocks, and what it cost in episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from policy_pkg.report.finished_runs import Run, read_lines
+from policy_pkg.train.run_dir import METRICS
+
+LAST_BLOCKS = 10
+CRASH_FREE = "success_crash_free"
+CRASH_FREE_RETURN = "return_crash_free"
+
+
+@dataclass(frozen=True)
+class Training:
+    """Figures of a run's metrics; None where it did not keep them.
+
+    ``blocks``: those with crash-free episodes, oldest first: (steps, success rate, mean return).
+    ``episodes``: that it learned from. ``evaluation_episodes``: that its blocks played besides.
+    """
+
+    blocks: tuple[tuple[int, float, float], ...]
+    episodes: int | None
+    evaluation_episodes: int | None
+
+    @property
+    def last_blocks(self) -> float | None:
+        """Mean crash-free success rate of the last LAST_BLOCKS blocks; None with fewer."""
+        if len(self.blocks) < LAST_BLOCKS:
+            return None
+        return float(np.mean([rate for _, rate, _ in self.blocks[-LAST_BLOCKS:]]))
+
+
+def training_of(run: Run) -> Training:
+    """Read from metrics.jsonl.
+
+    Raises:
+        RunError: it is damaged.
+    """
+    lines = read_lines(run.path / METRICS)
+    blocks = tuple(
+        (_steps(line), float(line[CRASH_FREE]), float(line[CRASH_FREE_RETURN]))
+        for line in lines
+        if line.get(CRASH_FREE) is not None and line.get(CRASH_FREE_RETURN) is not None
+    )
+    if not lines or "episodes" not in lines[-1]:  # of a run on recordings
+        return Training(blocks, None, None)
+    played = sum(_block_episodes(line, run.settings) for line in lines)
+    return Training(blocks, int(lines[-1]["episodes"]), played)
+
+
+def _steps(line: Mapping[str, Any]) -> int:
+    """Of the environment; of a run on recordings, which has none, gradient steps."""
+    return int(line["env_steps"] if "env_steps" in line else line["gradient_steps"])
+
+
+def _block_episodes(line: Mapping[str, Any], settings: Mapping[str, Any]) -> int:
+    """How many episodes a block played.
+
+    Its crash-free half is the block itself where nobody crashed in it.
+    """
+    count = int(settings["test_episodes"])
+    if settings.get("test_crash_free") and line.get("block_crashed"):
+        count *= 2
+    victims = sum(key.startswith("success_") and key.endswith("_crashed") for key in line)
+    return count + victims * int(settings.get("test_victim_episodes") or 0)
