@@ -244,7 +244,7 @@ def test_out(tmp_path: Path) -> None:
     with pytest.raises(CliError, match="there is no folder"):
         targets(tmp_path / "missing" / "a")
     (tmp_path / "b.svg").mkdir()
-    with pytest.raises(CliError, match=r"b\.svg is a directory"):
+    with pytest.raises(CliError, match=r"b\.svg: is a directory"):
         targets(tmp_path / "b")
 
 

@@ -34,6 +34,7 @@ _READ = {
     Kind.EVENT: ("kind", "episode", "step", "robot", "mode", "intent", "applied"),
 }  # fmt: skip
 _SAME = {Kind.SEEN: Kind.OBSERVATION, Kind.COMMAND: Kind.INTENT}
+_ROS2 = ("ros2msg", "ros2idl", "omgidl")
 _BROKEN = (
     struct.error, ValueError, IndexError, TypeError, OverflowError, MemoryError, SerdeError,
 )  # fmt: skip
@@ -49,7 +50,7 @@ class Decoder:
     """For the files of one bag. ``learn`` a channel before decoding what came on it."""
 
     def __init__(self) -> None:
-        self._stores: dict[tuple[str, str], Typestore] = {}
+        self._stores: dict[tuple[str, bytes], Typestore] = {}
 
     def learn(self, channel: Channel, kind: Kind) -> str | None:
         """Why messages of ``channel`` cannot be read as ``kind``; None: they can."""
@@ -78,12 +79,13 @@ class Decoder:
     def _store(self, channel: Channel) -> Typestore | None:
         key = (channel.msgtype, channel.definition)
         if key not in self._stores:
-            if channel.definition_encoding == "ros2msg":
-                types = get_types_from_msg(channel.definition, channel.msgtype)
-            elif channel.definition_encoding in ("ros2idl", "omgidl"):
-                types = get_types_from_idl(channel.definition)
-            else:
+            if channel.definition_encoding not in _ROS2:
                 return None
+            text = channel.definition.decode()
+            if channel.definition_encoding == "ros2msg":
+                types = get_types_from_msg(text, channel.msgtype)
+            else:
+                types = get_types_from_idl(text)
             store = get_typestore(Stores.EMPTY)
             store.max_sequence_length = _MAX_SEQUENCE
             store.register(types)

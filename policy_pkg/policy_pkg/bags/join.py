@@ -9,7 +9,7 @@ from typing import Any
 from policy_pkg.bags.bag import Bag, Scan, bag_entries
 from policy_pkg.bags.decode import Decoder, key_of
 from policy_pkg.bags.problems import Problem, Report, Severity
-from policy_pkg.bags.records import Channel, Entry
+from policy_pkg.bags.records import Channel, Entry, uncompressed
 from policy_pkg.bags.topics import OF_ROBOT, Kind, kind_of
 
 EFFECT = 1  # FaultEvent.EFFECT
@@ -155,21 +155,24 @@ class Joiner:
         kind, name, robot = found
         self.met.add(kind)
         try:
+            data = uncompressed(entry.data)
             if kind in OF_ROBOT:
-                number, step = key_of(entry.data)
-                return self._add_raw(kind, number, (step, robot), name, entry)
-            return self._add_other(kind, self.decoder.decode(channel, entry.data), entry.data)
+                number, step = key_of(data)
+                return self._add_raw(kind, number, (step, robot), name, channel, data)
+            return self._add_other(kind, self.decoder.decode(channel, data), data)
         except ValueError as error:
             self.problem(f"topic {channel.topic}: {error}")
             return None
 
-    def _add_raw(self, kind: Kind, number: int, key: Key, name: str, entry: Entry) -> Pieces | None:
+    def _add_raw(
+        self, kind: Kind, number: int, key: Key, name: str, channel: Channel, data: bytes
+    ) -> Pieces | None:
         pieces = self._pieces(number)
         if pieces is None:
             self.repeated += 1
             return None
         before = pieces.nbytes
-        if not pieces.add_raw(kind, key, name, entry.channel, entry.data):
+        if not pieces.add_raw(kind, key, name, channel, data):
             self.repeated += 1
         self._nbytes += pieces.nbytes - before
         return pieces

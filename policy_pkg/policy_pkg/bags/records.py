@@ -28,6 +28,7 @@ from policy_pkg.bags.problems import Problem, Report
 MAX_RECORD_BYTES = 1 << 28
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_ZSTD = b"\x28\xb5\x2f\xfd"  # how a frame of it begins
 _SCHEMA, _CHANNEL, _MESSAGE_CODE = 0x03, 0x04, 0x05
 _BROKEN = (
     McapError, CRCValidationError, struct.error, UnicodeDecodeError, ValueError, OverflowError,
@@ -43,7 +44,7 @@ class Channel:
     msgtype: str
     encoding: str
     definition_encoding: str
-    definition: str
+    definition: bytes  # not text in every encoding: it is decoded only where it is needed
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +73,7 @@ class ChannelTable:
             msgtype=schema.name if schema else "",
             encoding=record.message_encoding,
             definition_encoding=schema.encoding if schema else "",
-            definition=schema.data.decode() if schema else "",
+            definition=schema.data if schema else b"",
         )
         known = self.channels.get(record.id)
         if known is None:
@@ -85,6 +86,24 @@ class ChannelTable:
         if channel is None:
             raise ValueError(f"a message on channel {channel_id}, which is not described")
         return Entry(channel, log_time_ns, data)
+
+
+def uncompressed(data: bytes) -> bytes:
+    """A message as it was sent; `ros2 bag record --compression-mode message` compresses each one.
+
+    Raises:
+        ValueError: it cannot be decompressed, or says to be larger than MAX_RECORD_BYTES.
+    """
+    if data[: len(_ZSTD)] != _ZSTD:  # CDR begins with a zero
+        return data
+    try:
+        size = zstandard.frame_content_size(data)
+        if size > MAX_RECORD_BYTES:
+            raise ValueError(f"it says to hold {size} bytes, more than {MAX_RECORD_BYTES}")
+        limit = size if size >= 0 else MAX_RECORD_BYTES
+        return zstandard.ZstdDecompressor().decompress(data, max_output_size=limit)
+    except zstandard.ZstdError as error:
+        raise ValueError(f"a message compressed by itself cannot be read: {error}") from error
 
 
 def channels_of(path: Path) -> tuple[set[Channel], bool]:

@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from crash_coach_common.whole_output import write_whole
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.play.conditions import Condition
 from policy_pkg.play.evaluate import evaluate, evaluation_seed
@@ -168,6 +169,4 @@ def _checked(figures: Mapping[str, Any]) -> dict[str, Any]:
 
 def _write(path: Path, kept: Mapping[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
-    partial.replace(path)
+    write_whole(path, (json.dumps(kept, indent=1) + "\n").encode())

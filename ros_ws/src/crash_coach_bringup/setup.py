@@ -31,7 +31,7 @@ setup(
     zip_safe=False,
     entry_points={
         "console_scripts": [
-            "crash-coach = crash_coach_bringup.cli.main:main",
+            "crash-coach = crash_coach_bringup.cli.start:main",
         ],
     },
 )

@@ -15,8 +15,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
 
 from crash_coach_common.contract import FloatArray
+from crash_coach_common.whole_output import whole_output
 from sim_pkg.render.frames import Frames
-from sim_pkg.render.stage import INK, SITES, sites, whole_file
+from sim_pkg.render.stage import INK, SITES, sites
 
 PANEL_INCHES = 4.2
 ROBOT_RADIUS = 0.36  # of a cell
@@ -66,7 +67,8 @@ def draw_trajectories(panels: Sequence[Panel], path: Path) -> None:
     )  # fmt: skip
     figure.subplots_adjust(left=0.02, right=0.98, top=0.92, bottom=0.11, wspace=0.05)
     FigureCanvasAgg(figure)
-    with whole_file(path) as temporary:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_output(path) as temporary:
         figure.savefig(temporary, format="png")
 
 

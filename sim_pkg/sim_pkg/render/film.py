@@ -16,6 +16,7 @@ import numpy.typing as npt
 from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
 from PIL import Image
 
+from crash_coach_common.whole_output import whole_output
 from sim_pkg.render.frames import Frames, Side
 from sim_pkg.render.stage import (
     CRASHED,
@@ -34,7 +35,6 @@ from sim_pkg.render.stage import (
     site_colour,
     site_entry,
     sites,
-    whole_file,
 )
 
 MP4_FPS = 25
@@ -64,7 +64,8 @@ def write_video(frames: Frames, path: Path, speed: float = 1.0) -> None:
     if path.suffix not in writers:
         raise ValueError(f"{path}: a film is a .mp4 or .gif file")
     write, fps = writers[path.suffix]
-    with whole_file(path) as temporary:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_output(path) as temporary:
         write(_Film(frames), _times(frames, fps, speed), temporary)
 
 

@@ -11,6 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.patches import Circle, Polygon
 
 from crash_coach_common.contract import FloatArray
+from crash_coach_common.whole_output import whole_output
 from sim_pkg.render.frames import Actor, Frames, Side
 from sim_pkg.render.stage import (
     CRASHED,
@@ -23,7 +24,6 @@ from sim_pkg.render.stage import (
     outcome,
     scene_entries,
     sites,
-    whole_file,
 )
 
 STILL_DPI = 160
@@ -43,7 +43,8 @@ def draw_still(frames: Frames, path: Path) -> None:
         stage.ax.add_patch(patch)
     for index in reversed(range(len(frames.actors))):
         _draw_way(stage, frames, index)
-    with whole_file(path) as temporary:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_output(path) as temporary:
         stage.figure.savefig(temporary, format="png", dpi=STILL_DPI)
 
 

@@ -53,7 +53,7 @@ class Inbox:
         self._closed = -1  # every episode up to here is over
         self._lost: list[Lost] = []
         self._channels = {
-            kind: Channel(kind.value, TYPES[kind], "cdr", "", "")
+            kind: Channel(kind.value, TYPES[kind], "cdr", "", b"")
             for kind in (Kind.OBSERVATION, Kind.SEEN, Kind.COMMAND)
         }
 

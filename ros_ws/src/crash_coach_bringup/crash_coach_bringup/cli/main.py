@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import signal
 import sys
+from typing import NoReturn
 
 import typer
 
+from crash_coach_bringup.cli import signals
 from crash_coach_bringup.cli.faults import verb as faults
 from crash_coach_bringup.cli.multi_value import expand
 from crash_coach_bringup.cli.report import verb as report
+from crash_coach_bringup.cli.terminal import degrade_characters
 from crash_coach_bringup.cli.verbs import (
     bags,
     calibrate,
@@ -30,6 +35,12 @@ from crash_coach_bringup.cli.verbs import (
 )
 from crash_coach_common.contract import UserError
 from crash_coach_console.command import console
+
+# An OSError with one of these is no defect of ours.
+SURROUNDINGS = frozenset({
+    errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBUSY,
+    errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.EMFILE, errno.ENFILE,
+})  # fmt: skip
 
 app = typer.Typer(
     name="crash-coach",
@@ -69,13 +80,32 @@ def main() -> None:
     # One thread per process, also where the shell did not say so.
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
+    degrade_characters()
     try:
-        app(args=repeat_options(sys.argv[1:]))
+        with signals.raised():
+            app(args=repeat_options(sys.argv[1:]))
     except UserError as error:
-        print(f"crash-coach: error: {error}", file=sys.stderr)  # noqa: T201
-        sys.exit(1)
+        _fail(f"error: {error}")
+    except OSError as error:
+        if error.errno not in SURROUNDINGS:
+            raise
+        _fail(f"error: {error.filename or 'writing'}: {error.strerror}")
+    except signals.Terminated:
+        print(signals.line(signal.SIGTERM), file=sys.stderr)  # noqa: T201
+        raise
     except KeyboardInterrupt:
-        sys.exit(130)
+        print(signals.line(signal.SIGINT), file=sys.stderr)  # noqa: T201
+        sys.exit(signals.exit_code(signal.SIGINT))
+    except SystemExit as end:
+        # What typer makes of a KeyboardInterrupt that no verb caught.
+        if isinstance(getattr(end.__context__, "__cause__", None), KeyboardInterrupt):
+            print(signals.line(signal.SIGINT), file=sys.stderr)  # noqa: T201
+        raise
+
+
+def _fail(text: str) -> NoReturn:
+    print(f"crash-coach: {text}", file=sys.stderr)  # noqa: T201
+    sys.exit(1)
 
 
 if __name__ == "__main__":

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
 from crash_coach_bringup.cli.fitted_table import FittedConsole, FittedTable
 from crash_coach_common.contract import UserError
+from crash_coach_common.whole_output import check_output, write_whole
 from policy_pkg.statistics import Estimate
 
 console = FittedConsole()
@@ -23,31 +24,60 @@ def write_json(path: Path | None, result: Mapping[str, Any]) -> None:
     """Writes ``result`` whole or not at all; does nothing without a path.
 
     Raises:
-        CliError: the folder does not exist or cannot be written.
+        CliError: it cannot be written.
     """
-    if path is None:
-        return
-    partial = path.with_name(path.name + ".partial")
+    if path is not None:
+        write_file("--json", path, (json.dumps(result, indent=2) + "\n").encode())
+
+
+def write_file(option: str, path: Path, content: bytes) -> None:
+    """Writes ``content`` as ``whole_output`` does. Raises CliError where it cannot."""
     try:
-        with open(partial, "w") as out:
-            json.dump(result, out, indent=2)
-            out.write("\n")
-        os.replace(partial, path)
+        write_whole(path, content)
     except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise CliError(f"--json {path}: {error.strerror}: {error.filename}") from None
+        raise CliError(not_written(option, path, error)) from None
+
+
+def not_written(option: str, path: Path, error: OSError) -> str:
+    """The one line on an output that failed."""
+    return f"{option} {path}: cannot be written: {error.strerror or error}"
+
+
+@contextmanager
+def done_first(write: Callable[[], None]) -> Iterator[None]:
+    """Calls ``write``, then runs the body, which prints what was computed.
+
+    In this order a table that cannot be printed costs no file; and the body runs also where the
+    file could not be written, so that what was computed is seen.
+
+    Raises:
+        CliError: of ``write``; after the body.
+    """
+    failure: CliError | None = None
+    try:
+        write()
+    except CliError as error:
+        failure = error
+    yield
+    if failure is not None:
+        raise failure
+
+
+def written_first(path: Path | None, result: Mapping[str, Any]) -> AbstractContextManager[None]:
+    """``done_first`` of ``write_json``."""
+    return done_first(lambda: write_json(path, result))
 
 
 def check_file_target(option: str, path: Path) -> None:
     """Refuses a file that cannot be written before the work, not after it.
 
     Raises:
-        CliError: a missing folder, or a directory in the way.
+        CliError: a missing folder, a directory in the way, or a folder that takes no file.
     """
-    if not path.absolute().parent.is_dir():
-        raise CliError(f"{option} {path}: there is no folder {path.absolute().parent}")
-    if path.is_dir():
-        raise CliError(f"{option} {path}: is a directory")
+    try:
+        check_output(path)
+    except OSError as error:
+        raise CliError(f"{option} {path}: {error.strerror}") from None
 
 
 def check_json_target(path: Path | None) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from crash_coach_bringup.cli.markdown import table
-from crash_coach_bringup.cli.output import CliError, percent_ci
+from crash_coach_bringup.cli.output import CliError, not_written, percent_ci
 from policy_pkg.play.evaluate import Evaluation
 from policy_pkg.report.verdict import FaultRun, Verdict
 
@@ -68,8 +68,11 @@ def check_target(out: Path) -> None:
     Raises:
         CliError: no folder to put it in, or something in the way that is not a report.
     """
-    if not out.absolute().parent.is_dir():
-        raise CliError(f"--out {out}: there is no folder {out.absolute().parent}")
+    parent = out.resolve().parent
+    if not parent.is_dir():
+        raise CliError(f"--out {out}: there is no folder {parent}")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise CliError(f"--out {out}: the folder {parent} cannot be written to")
     if not os.path.exists(out):
         return
     try:
@@ -105,7 +108,7 @@ def write(out: Path, played: Played, run: FaultRun) -> None:
 
 
 def _replace(out: Path, content: Mapping[str, bytes]) -> None:
-    out = out.absolute()
+    out = out.resolve()  # a link stays, and what it leads to is replaced
     new = out.with_name(f".{out.name}.{os.getpid()}.partial")
     old = out.with_name(f".{out.name}.{os.getpid()}.old")
     moved = False
@@ -120,7 +123,7 @@ def _replace(out: Path, content: Mapping[str, bytes]) -> None:
     except OSError as error:
         if moved:
             old.rename(out)
-        raise CliError(f"--out {out}: cannot be written: {error.strerror}") from None
+        raise CliError(not_written("--out", out, error)) from None
     finally:
         shutil.rmtree(new, ignore_errors=True)
     shutil.rmtree(old, ignore_errors=True)

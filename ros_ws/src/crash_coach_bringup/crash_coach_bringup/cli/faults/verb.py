@@ -13,7 +13,14 @@ from rich.text import Text
 from crash_coach_bringup.cli.faults.docs import generated, update
 from crash_coach_bringup.cli.faults.play import check_scenario, play
 from crash_coach_bringup.cli.faults.report import Played, check_target, measured, write
-from crash_coach_bringup.cli.output import CliError, check_file_target, console, table
+from crash_coach_bringup.cli.output import (
+    CliError,
+    check_file_target,
+    console,
+    done_first,
+    table,
+    write_file,
+)
 from crash_coach_bringup.cli.verbs.evaluate import (
     MOST_EPISODES,
     Layout,
@@ -93,9 +100,9 @@ def run_verb(
         seconds=time.monotonic() - start_s,
     )
     how = f"{episodes} episodes, seed {seed}, via {via}"
-    show(f"{played.name}: {policy} on {target.scenario}, {how}", run)
+    with done_first(lambda: None if out is None else write(out, played, run)):
+        show(f"{played.name}: {policy} on {target.scenario}, {how}", run)
     if out is not None:
-        write(out, played, run)
         console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
     if not run.passed:
         raise typer.Exit(1)
@@ -136,8 +143,9 @@ def docs_verb(
         return
     check_file_target("--page", page)
     try:
-        page.write_text(update(page.read_text("utf-8")), "utf-8")
+        text = update(page.read_text("utf-8"))
     except UnicodeDecodeError:
         raise CliError(f"--page {page}: not UTF-8 text") from None
     except OSError as error:
         raise CliError(f"--page {page}: {error.strerror}") from None
+    write_file("--page", page, text.encode())

@@ -16,7 +16,7 @@ from crash_coach_bringup.cli.options import (
     conditions,
     mode_parameters,
 )
-from crash_coach_bringup.cli.output import CliError, console, write_json
+from crash_coach_bringup.cli.output import CliError, console, write_file, write_json, written_first
 from crash_coach_bringup.cli.report.findings import Findings
 from crash_coach_bringup.cli.report.other_tables import as_csv, as_latex
 from crash_coach_bringup.cli.report.page import page
@@ -211,10 +211,11 @@ def _write(out: Path, findings: Findings, results: Sequence[Result], extra: Extr
         tables["table.csv"] = as_csv(findings.rows)
     if extra.latex:
         tables["table.tex"] = as_latex(findings.rows)
-    for name, content in tables.items():
-        (out / name).write_text(content, encoding="utf-8")
-    write_json(out / "results.json", findings.to_json())
+    with written_first(out / "results.json", findings.to_json()):
+        console.print(text, markup=False, highlight=False, soft_wrap=True)
     write_json(out / "marl_eval.json", as_marl_eval(results))
+    for name, content in tables.items():
+        write_file("--out", out / name, content.encode())
     # Imported here: no other verb should wait for matplotlib.
     from crash_coach_bringup.cli.report import figures as report_figures
 
@@ -222,7 +223,6 @@ def _write(out: Path, findings: Findings, results: Sequence[Result], extra: Extr
     if extra.trajectories is not None:
         seeds = extra.trajectories, findings.about["seed"]
         drawn.append(report_figures.trajectories(results, *seeds, out))
-    console.print(text, markup=False, highlight=False, soft_wrap=True)
     written = (out / name for name in (*tables, "results.json", "marl_eval.json"))
     for path in (*written, *drawn):
         console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)

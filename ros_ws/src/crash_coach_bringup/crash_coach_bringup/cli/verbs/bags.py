@@ -15,6 +15,7 @@ from crash_coach_bringup.cli.output import (
     percent_ci,
     table,
     write_json,
+    written_first,
 )
 from policy_pkg.bags.bag import Bag, find_bags
 from policy_pkg.bags.dataset import BagReading, BagSummary
@@ -87,12 +88,10 @@ def _drops(summary: BagSummary) -> str:
 def info(folders: Folders, json: JsonOption = None) -> None:
     """Robots, episodes, success, crashes by mode, gaps and drops of each recording."""
     check_json_target(json)
-    results = []
-    for bag in find_bags(folders):
-        summary, problems = read(bag)
-        show(summary, problems)
-        results.append(as_json(summary, problems))
-    write_json(json, {"bags": results})
+    found = [read(bag) for bag in find_bags(folders)]
+    with written_first(json, {"bags": [as_json(*each) for each in found]}):
+        for each in found:
+            show(*each)
 
 
 def check(

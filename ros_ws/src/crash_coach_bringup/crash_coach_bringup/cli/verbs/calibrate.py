@@ -23,7 +23,7 @@ from crash_coach_bringup.cli.output import (
     console,
     percent_ci,
     table,
-    write_json,
+    written_first,
 )
 from crash_coach_bringup.cli.verbs.evaluate import MOST_EPISODES
 from policy_pkg.play.conditions import Condition
@@ -162,8 +162,9 @@ def calibrate(
     }
     rows: list[dict[str, Any]] = []
     for scenario, played in asked.items():
-        here = rows_of(scenario, played, episodes, seed)
-        show(f"{scenario}: {episodes} episodes each, seed {seed}", here)
-        rows += here
+        rows += rows_of(scenario, played, episodes, seed)
     how = {"mode": mode, "parameters": parameters}
-    write_json(json, {"seed": seed, "episodes": episodes, **how, "rows": rows})
+    with written_first(json, {"seed": seed, "episodes": episodes, **how, "rows": rows}):
+        for scenario in asked:
+            here = [row for row in rows if row["scenario"] == scenario]
+            show(f"{scenario}: {episodes} episodes each, seed {seed}", here)

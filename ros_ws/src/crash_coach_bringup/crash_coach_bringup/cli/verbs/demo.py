@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from crash_coach_bringup.cli.jobs import Job, run_jobs
-from crash_coach_bringup.cli.output import console, percent_ci, table, write_json
+from crash_coach_bringup.cli.output import console, percent_ci, table, written_first
 from crash_coach_bringup.cli.verbs.evaluate import ALIKE, Layout, as_json
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.play.conditions import Condition, crash_free, named
@@ -152,7 +152,10 @@ def demo(
     out.mkdir(parents=True, exist_ok=True)
     train_teams(out, override or [], train_seed)
     results = run_graphs(out, episodes, seed, layout)
-    show(results, episodes)
+    bundle = load_policy(out / "adaptive")
+    found = judge(results, int(bundle.meta["config"]["total_steps"]), out)
+    with written_first(out / "summary.json", summary(results, found, out, seed)):
+        show(results, episodes)
     picture = out / "trajectories.png"
     # Imported here: matplotlib takes its time.
     from crash_coach_bringup.cli.picture import TeamResults, draw_first_episodes
@@ -165,9 +168,6 @@ def demo(
         load_policy(out / "qmix").scenario,
         picture,
     )
-    bundle = load_policy(out / "adaptive")
-    found = judge(results, int(bundle.meta["config"]["total_steps"]), out)
-    write_json(out / "summary.json", summary(results, found, out, seed))
     console.print("Everything lies here:")
     for what, where in (
         ("team trained plainly", out / "qmix"),

@@ -14,7 +14,7 @@ from typing import Annotated
 
 import typer
 
-from crash_coach_bringup.cli.output import check_json_target, console, table, write_json
+from crash_coach_bringup.cli.output import check_json_target, console, table, written_first
 from policy_pkg.kernels import SAME_EVERYWHERE, kernels
 
 LIBRARIES = ("numpy", "numba", "pymunk", "torch", "safetensors", "pydantic", "matplotlib")
@@ -141,7 +141,7 @@ def doctor(
     for row in findings:
         mark = "[green]ok[/green]" if row.ok else "[red]MISSING[/red]"
         rows.add_row(row.check, mark, row.found, row.hint)
-    console.print(rows)
-    write_json(json, {"findings": [asdict(row) for row in findings]})
+    with written_first(json, {"findings": [asdict(row) for row in findings]}):
+        console.print(rows)
     if not all(row.ok for row in findings):
         raise typer.Exit(1)

@@ -24,7 +24,7 @@ from crash_coach_bringup.cli.output import (
     percent_ci,
     points,
     table,
-    write_json,
+    written_first,
 )
 from policy_pkg.play.conditions import Condition
 from policy_pkg.play.evaluate import Evaluation, Scripted, evaluation_seed
@@ -197,12 +197,13 @@ def evaluate(
     asked = conditions(target.robots, *who, mode, parameters, each_robot=each_robot)
     played = play(target, asked, episodes, evaluation_seed(seed), processes, via, layout)
     results = list(zip(asked, played, strict=True))
-    show(f"{team} on {name}: {episodes} episodes each, seed {seed}, via {via}", results)
     summaries = as_json(results)
     trajectory_hash = combine(row["trajectory_hash"] for row in summaries)
-    console.print(f"trajectory hash {trajectory_hash}", soft_wrap=True)
     result: dict[str, Any] = {"team": team, "scenario": name, "via": via.value}
     result["layout"] = layout.value if via is Via.ros else None
     result |= {"seed": seed, "key": evaluation_seed(seed), "episodes": episodes}
     result |= {"mode": mode, "parameters": parameters}
-    write_json(json, {**result, "trajectory_hash": trajectory_hash, "conditions": summaries})
+    result |= {"trajectory_hash": trajectory_hash, "conditions": summaries}
+    with written_first(json, result):
+        show(f"{team} on {name}: {episodes} episodes each, seed {seed}, via {via}", results)
+        console.print(f"trajectory hash {trajectory_hash}", soft_wrap=True)

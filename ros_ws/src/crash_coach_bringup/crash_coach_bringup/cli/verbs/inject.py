@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from crash_coach_bringup.cli.options import ModeOption, ParamOption, mode_parameters
-from crash_coach_bringup.cli.output import CliError, check_json_target, console, write_json
+from crash_coach_bringup.cli.output import CliError, check_json_target, console, written_first
 
 
 class ApplyAt(StrEnum):
@@ -53,11 +53,11 @@ def inject(
 
     if clear:
         answer = client.clear(timeout_s)
-        console.print(answer)
-        write_json(json, {"cleared": True, "answer": answer})
+        with written_first(json, {"cleared": True, "answer": answer}):
+            console.print(answer)
         return
     result = client.inject(
         victims or [], mode, apply_at.value, duration_steps, start, timeout_s, parameters=parameters
     )
-    console.print(str(result))
-    write_json(json, asdict(result))
+    with written_first(json, asdict(result)):
+        console.print(str(result))

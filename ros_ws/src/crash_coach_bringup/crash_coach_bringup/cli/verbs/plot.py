@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -18,10 +17,13 @@ from crash_coach_bringup.cli.curves import (
 )
 from crash_coach_bringup.cli.output import (
     CliError,
+    check_file_target,
     check_json_target,
     console,
-    write_json,
+    not_written,
+    written_first,
 )
+from crash_coach_common.whole_output import whole_output
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -130,16 +132,12 @@ def save(figure: Figure, path: Path, kind: str) -> None:
     """
     from matplotlib import rc_context
 
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     metadata = {"Date": None} if kind == "svg" else {}
     try:
-        with rc_context({"svg.hashsalt": "crash-coach"}):
-            figure.savefig(partial, format=kind, metadata=metadata)
-        partial.replace(path)
+        with rc_context({"svg.hashsalt": "crash-coach"}), whole_output(path) as temporary:
+            figure.savefig(temporary, format=kind, metadata=metadata)
     except OSError as error:
-        raise CliError(f"--out: {path} cannot be written: {error.strerror}") from None
-    finally:
-        partial.unlink(missing_ok=True)
+        raise CliError(not_written("--out", path, error)) from None
 
 
 def targets(stem: Path) -> dict[str, Path]:
@@ -151,12 +149,9 @@ def targets(stem: Path) -> dict[str, Path]:
     name = stem.stem if stem.suffix[1:] in FORMATS else stem.name
     if not name:
         raise CliError(f"--out {stem}: a file name without suffix is needed, such as curves")
-    if not stem.absolute().parent.is_dir():
-        raise CliError(f"--out {stem}: there is no folder {stem.absolute().parent}")
     found = {kind: stem.with_name(f"{name}.{kind}") for kind in FORMATS}
     for path in found.values():
-        if path.is_dir():
-            raise CliError(f"--out {stem}: {path} is a directory")
+        check_file_target("--out", path)
     return found
 
 
@@ -211,19 +206,16 @@ def plot(
         {key: average(group, key) for key in group.runs[0].kind.curves} for group in groups
     ]
     figure = draw(groups, curves)
-    for kind, path in files.items():
-        save(figure, path, kind)
-    for group in groups:
-        console.print(legend(group), markup=False, highlight=False, soft_wrap=True)
-        if text := note(group):
-            console.print(f"  {text}", markup=False, highlight=False, soft_wrap=True)
-    for path in files.values():
-        console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
     pairs = zip(groups, curves, strict=True)
-    write_json(
-        json,
-        {
-            "files": [str(path) for path in files.values()],
-            "groups": [as_json(group, each) for group, each in pairs],
-        },
-    )
+    result = {
+        "files": [str(path) for path in files.values()],
+        "groups": [as_json(group, each) for group, each in pairs],
+    }
+    with written_first(json, result):
+        for group in groups:
+            console.print(legend(group), markup=False, highlight=False, soft_wrap=True)
+            if text := note(group):
+                console.print(f"  {text}", markup=False, highlight=False, soft_wrap=True)
+        for kind, path in files.items():
+            save(figure, path, kind)
+            console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)

@@ -12,7 +12,7 @@ from crash_coach_bringup.cli.output import (
     check_json_target,
     console,
     table,
-    write_json,
+    written_first,
 )
 from policy_pkg.train.config import TrainConfig, load_train_config
 
@@ -170,11 +170,11 @@ def profile(
 
     with console.status("starting") as status:
         result = measure(settings, seconds, tell=status.update)
-    show(f"{config} on {settings.scenario}, n_envs {settings.n_envs}", result)
-    for line in summary(result, settings):
-        console.print(line, soft_wrap=True, highlight=False)
-    console.print("what to change:")
-    for line in hints(result):
-        console.print(f"  {line}", soft_wrap=True, highlight=False)
     about = {"config": settings.model_dump(mode="json")}
-    write_json(json, {**about, **as_json(result, settings)})
+    with written_first(json, {**about, **as_json(result, settings)}):
+        show(f"{config} on {settings.scenario}, n_envs {settings.n_envs}", result)
+        for line in summary(result, settings):
+            console.print(line, soft_wrap=True, highlight=False)
+        console.print("what to change:")
+        for line in hints(result):
+            console.print(f"  {line}", soft_wrap=True, highlight=False)

@@ -20,7 +20,8 @@ from crash_coach_bringup.cli.output import (
     check_file_target,
     check_json_target,
     console,
-    write_json,
+    not_written,
+    written_first,
 )
 from crash_coach_common.strict_yaml import ConfigError
 from policy_pkg.bags.bag import is_recording
@@ -61,7 +62,8 @@ def draw(frames: Frames, out: Path, speed: float) -> None:
         else:
             write_video(frames, out, speed)
     except OSError as error:
-        raise CliError(f"--out: {out} cannot be written: {error.strerror}") from None
+        raise CliError(not_written("--out", out, error)) from None
+    console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
 
 
 def outcome(frames: Frames) -> dict[str, Any]:
@@ -78,12 +80,11 @@ def outcome(frames: Frames) -> dict[str, Any]:
     }
 
 
-def show(frames: Frames, out: Path) -> None:
+def tell(frames: Frames) -> None:
     who = ", ".join(frames.actors[i].name for i in frames.faulted) or "nobody"
     done = "success" if frames.success else "no success"
     told = f"episode {frames.episode}: {done} after {frames.steps} steps; crashed: {who}"
     console.print(told, highlight=False)
-    console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
 
 
 def recorded(name: str, episode: int | None, scenario: str | None) -> tuple[Frames, dict[str, Any]]:
@@ -157,9 +158,9 @@ def render(
         (frames,) = record(target.team, target.scenario, condition, one, evaluation_seed(seed))
         crash = condition.crash.model_dump(mode="json")
         which = {"team": team, "condition": condition.name, "crash": crash, "seed": seed}
-    draw(frames, out, speed)
-    show(frames, out)
-    write_json(json, {**outcome(frames), **which, "file": str(out)})
+    with written_first(json, {**outcome(frames), **which, "file": str(out)}):
+        tell(frames)
+        draw(frames, out, speed)
 
 
 def refuse_options_of_a_team(context: typer.Context) -> None:

@@ -1,0 +1,67 @@
+"""SIGINT and SIGTERM as one line and an exit code, from the first moment to the last."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import NoReturn
+
+WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
+
+
+class Terminated(SystemExit):
+    """SIGTERM, as an exception, so that what was begun is ended in order."""
+
+    def __init__(self) -> None:
+        super().__init__(exit_code(signal.SIGTERM))
+
+
+def exit_code(number: int) -> int:
+    """As a shell tells it."""
+    return 128 + number
+
+
+def line(number: int) -> str:
+    return f"crash-coach: {WORDS[signal.Signals(number)]}"
+
+
+def leave_at_once() -> None:
+    """For the time in which libraries are loaded: nothing is begun that had to be ended in order,
+    and an exception could come out anywhere in them, or be swallowed."""
+    for number in WORDS:
+        _set(number, _leave)
+
+
+def _leave(number: int, frame: FrameType | None) -> NoReturn:
+    os.write(2, f"{line(number)}\n".encode())
+    os._exit(exit_code(number))
+
+
+@contextmanager
+def raised() -> Iterator[None]:
+    """In the body SIGINT is KeyboardInterrupt and SIGTERM Terminated; in the main thread only."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in WORDS}
+    _set(signal.SIGINT, signal.default_int_handler)
+    _set(signal.SIGTERM, _terminate)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _terminate(number: int, frame: FrameType | None) -> NoReturn:
+    raise Terminated
+
+
+def _set(number: int, handler: signal._HANDLER) -> None:
+    """Unless the signal is ignored, as under nohup."""
+    if signal.getsignal(number) is not signal.SIG_IGN:
+        signal.signal(number, handler)
