@@ -11,7 +11,7 @@ CODE := sim_pkg policy_pkg crash_coach_pkg ros_ws/src/crash_coach_common ros_ws/
     ros_ws/src/crash_coach_console tests benchmarks scripts
 PAGE := ros_ws/src/crash_coach_console/crash_coach_console/web
 
-.PHONY: help setup check test demo bench soak ray format lock clean
+.PHONY: help setup check test demo bench soak ray environments format lock clean
 
 help: ## this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -28,7 +28,7 @@ check: setup ## ruff, mypy, the architecture's laws, the documents' commands
 	$(IN_ENV) oxlint --quiet --deny-warnings $(PAGE)
 	$(IN_ENV) $(PYTEST) $(CHECKED)
 
-test: setup ## the test suite (but for what `make check` runs), under 5 minutes on 2 cores
+test: setup environments ## the test suite (but for what `make check` runs), under 5 minutes on 2 cores
 	$(IN_ENV) $(PYTEST) -m "not soak" -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0 $(CHECKED:%=--ignore=%)
 
 demo: setup ## train two teams, run them as ROS graphs, crash robots, read off the cost
@@ -37,20 +37,25 @@ demo: setup ## train two teams, run them as ROS graphs, crash robots, read off t
 bench: setup ## every benchmark, to runs/bench.json
 	$(IN_ENV) python -m benchmarks
 
-soak: setup ray ## fuzz, kill and latency tests at full size
+soak: setup ray environments ## fuzz, kill and latency tests at full size
 	$(IN_ENV) $(PYTEST) -m soak --timeout 3600
 
 ray: setup ## the extra that `crash-coach sweep --engine ray` needs
 	@.venv/bin/uv pip install --quiet --python .venv/bin/python -r requirements-ray.lock
 
+environments: setup ## PettingZoo environments of others that the documents train on
+	@.venv/bin/uv pip install --quiet --python .venv/bin/python -r requirements-environments.lock
+
 format: setup ## put the code in its format
 	$(IN_ENV) ruff format $(CODE) && ruff check --fix $(CODE)
 
-lock: setup ## requirements.in -> requirements.lock, and the extra's
+lock: setup ## requirements.in -> requirements.lock, and the extras'
 	.venv/bin/uv pip compile --quiet --universal --no-header --python-version 3.11 \
 	    requirements.in -o requirements.lock
 	.venv/bin/uv pip compile --quiet --universal --no-header --python-version 3.11 \
 	    -c requirements.lock requirements-ray.in -o requirements-ray.lock
+	.venv/bin/uv pip compile --quiet --universal --no-header --python-version 3.11 \
+	    -c requirements.lock requirements-environments.in -o requirements-environments.lock
 
 clean: ## remove what set-up and builds left (runs/ stays)
 	rm -rf .venv ros_ws/build ros_ws/install ros_ws/log

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -16,43 +17,72 @@ from crash_coach_common.contract import (
     IntArray,
     StepResult,
 )
-from crash_coach_common.strict_yaml import (
-    ConfigError,
-    StrictModel,
-    did_you_mean,
-    load_tree,
-    validate,
-)
-from sim_pkg.scenario_files import find_scenario, scenario_names
+from crash_coach_common.strict_yaml import ConfigError, StrictModel, did_you_mean, validate
+from sim_pkg.foreign.config import KIND as FOREIGN
+from sim_pkg.scenario_files import scenario_names
+from sim_pkg.scenario_source import ScenarioSource, read_scenario
 from sim_pkg.scenarios.base import Buffers, Scenario, Scene
 from sim_pkg.scenarios.kinds import KINDS
 from sim_pkg.world import Float64Array, World
 
-__all__ = ["Env", "make_env", "scenario_names"]
+if TYPE_CHECKING:
+    from sim_pkg.foreign.env import ForeignEnv
+
+__all__ = ["Env", "ScenarioLike", "make_any_env", "make_env", "scenario_names"]
+
+ScenarioLike = str | Path | ScenarioSource
+"""What an environment can be made of: a name, a file, a reference, or what was read of one."""
 
 
-def make_env(scenario: str | Path, n_arenas: int) -> Env:
-    """B independent arenas of a scenario.
+def make_env(scenario: ScenarioLike, n_arenas: int) -> Env:
+    """B independent arenas of a scenario of ours: with bodies, positions and pictures.
 
     Args:
-        scenario: a name of ``scenario_names()``, or the path of a YAML file.
+        scenario: a name of ``scenario_names()``, the path of a YAML file, or what was read of it.
         n_arenas: at least 1.
 
     Raises:
-        ConfigError: unknown scenario, or a file that is wrong (which key, and why).
+        ConfigError: unknown scenario, a file that is wrong (which key, and why), or an environment
+            of somebody else.
         ValueError: n_arenas below 1.
     """
     if n_arenas < 1:
         raise ValueError(f"n_arenas is {n_arenas}; at least 1 is needed")
-    tree = load_tree(find_scenario(scenario))
+    source = _source(scenario)
+    tree = source.tree()
     kind = tree.values.get("kind")
-    if not isinstance(kind, str) or kind not in KINDS:
+    if kind == FOREIGN:
         raise ConfigError(
-            f"{tree.where(('kind',))}: kind = {kind!r}{did_you_mean(str(kind), KINDS)}; "
-            f"one of: {', '.join(KINDS)}"
+            f"scenario {source.name!r} is a PettingZoo environment: that is played in one process "
+            "only, it has no bodies, no ROS graph and no recordings"
+        )
+    if not isinstance(kind, str) or kind not in KINDS:
+        known = [*KINDS, FOREIGN]
+        raise ConfigError(
+            f"{tree.where(('kind',))}: kind = {kind!r}{did_you_mean(str(kind), known)}; "
+            f"one of: {', '.join(known)}"
         )
     config = validate(tree, KINDS[kind].config)
-    return Env(KINDS[kind].build(config, str(scenario), n_arenas), n_arenas)
+    return Env(KINDS[kind].build(config, source.name, n_arenas), n_arenas)
+
+
+def make_any_env(scenario: ScenarioLike, n_arenas: int, pictures: bool = False) -> Env | ForeignEnv:
+    """As ``make_env``, also of ``pettingzoo:`` environments.
+
+    pictures: the environment of somebody else will be asked to draw itself.
+    """
+    source = _source(scenario)
+    foreign = source.foreign()
+    if foreign is None:
+        return make_env(source, n_arenas)
+    # Imported here: who has scenarios of ours only needs no gymnasium.
+    from sim_pkg.foreign.env import ForeignEnv
+
+    return ForeignEnv(foreign, source.name, n_arenas, pictures)
+
+
+def _source(scenario: ScenarioLike) -> ScenarioSource:
+    return scenario if isinstance(scenario, ScenarioSource) else read_scenario(scenario)
 
 
 class Env:

@@ -20,7 +20,7 @@ from crash_coach_common.contract import (
 from crash_coach_pkg.effects import EffectRow
 from crash_coach_pkg.faults import mode_code, unmet_needs
 from crash_coach_pkg.faults.batch_faults import apply_faults
-from crash_coach_pkg.plan import CrashPlan
+from crash_coach_pkg.plan import CrashPlan, TriggerKind
 from crash_coach_pkg.schedule import World
 from policy_pkg.play.injected import InjectedArena, is_static
 from policy_pkg.play.teams import Team, ValuingTeam, offers
@@ -107,6 +107,13 @@ class Arenas:
             self._inject(int(arena), plan)
 
     def _inject(self, arena: int, plan: CrashPlan) -> None:
+        if not self.spec.reports_positions and any(
+            fault.trigger.kind == TriggerKind.NEAR for fault in plan.faults
+        ):
+            raise UserError(
+                f"episode {plan.episode}: scenario {self.spec.scenario!r} does not tell where its "
+                "robots are: near_radius_m (a fault's condition) cannot be used"
+            )
         for mode in {fault.mode for fault in plan.faults}:
             if reason := unmet_needs(mode, offers(self._team)):
                 raise UserError(f"episode {plan.episode}: {reason}")

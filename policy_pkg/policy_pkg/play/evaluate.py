@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
-from crash_coach_common.contract import BatchEnv, EnvSpec, UserError
+from crash_coach_common.contract import BatchEnv, EnvSpec, IntArray, UserError
 from crash_coach_pkg.coach.coach import Coach, Planner
 from crash_coach_pkg.coach.config import TeamSpec
 from crash_coach_pkg.effects import EffectRow
@@ -20,10 +20,13 @@ from policy_pkg.play.conditions import Condition, Planned
 from policy_pkg.play.teams import RecurrentTeam, ScriptedTeam, Team, offers
 from policy_pkg.policy import RecurrentPolicy
 from policy_pkg.statistics import Estimate, wilson
-from sim_pkg.env import Env, make_env
+from sim_pkg.env import Env, ScenarioLike, make_any_env, make_env
 from sim_pkg.render.frames import Frames, Recorder
-from sim_pkg.scripted import make_scripted
+from sim_pkg.scripted import ConfiguredEnv, make_scripted
 from sim_pkg.trajectory import CourseHash, TrajectoryHash, combine
+
+if TYPE_CHECKING:
+    from sim_pkg.foreign.pictures import Pictures
 
 EVALUATION = 1 << 62  # beyond every seed of a training, and so of its blocks
 
@@ -61,6 +64,7 @@ class Evaluation:
     ``drawn``: as of the condition.
     ``effects``: sorted, if asked for: ACTIVE and CLEARED where a stretch of a fault begins and ends
     within its episode, EFFECT per robot-step with a command, or (OBSERVED) observation fault.
+    ``reports_success``: whether the scenario tells what a success is; if not, rates mean nothing.
     """
 
     condition: str
@@ -69,6 +73,7 @@ class Evaluation:
     episodes: tuple[EpisodeResult, ...]
     effects: tuple[EffectRow, ...] = ()
     drawn: bool = True
+    reports_success: bool = True
 
     @property
     def success_rate(self) -> float:
@@ -96,14 +101,18 @@ class Evaluation:
         return wilson(sum(e.success for e in self.episodes), len(self.episodes))
 
     def summary(self) -> dict[str, Any]:
-        """JSON values. ``return_std`` is the sample's; ``crashed_fraction`` is per robot;
-        ``success_ci95`` is null where the episodes are ``alike``."""
+        """JSON values. ``return_std`` is the sample's; ``crashed_fraction`` is per robot.
+
+        ``success_ci95`` is null where the episodes are ``alike``, and with ``success_rate`` where
+        the scenario reports no success.
+        """
         returns = np.array([e.episode_return for e in self.episodes])
         interval = self.success
         crashed = sum(len(e.crashed) for e in self.episodes)
+        known = self.reports_success and not self.alike
         return {
-            "success_rate": self.success_rate,
-            "success_ci95": None if self.alike else [interval.low, interval.high],
+            "success_rate": self.success_rate if self.reports_success else None,
+            "success_ci95": [interval.low, interval.high] if known else None,
             "return_mean": self.return_mean,
             "return_std": float(returns.std(ddof=1)) if len(returns) > 1 else 0.0,
             "steps_mean": float(np.mean([e.steps for e in self.episodes])),
@@ -123,7 +132,7 @@ class Scripted:
 
 def evaluate(
     target: PolicyBundle | RecurrentPolicy | Scripted,
-    scenario: str | Path,
+    scenario: ScenarioLike,
     condition: Condition | Planned,
     episodes: int | range,
     seed: int,
@@ -143,7 +152,7 @@ def evaluate(
     numbers = episodes if isinstance(episodes, range) else range(episodes)
     if not numbers:
         raise UserError(f"episodes = {episodes}: at least 1 is needed")
-    env = make_env(scenario, max(1, min(n_arenas, len(numbers))))
+    env = make_any_env(scenario, max(1, min(n_arenas, len(numbers))))
     run = _Run(env, _team(target, env), condition, seed, [] if effects else None)
     return run.evaluation(numbers)
 
@@ -157,7 +166,7 @@ def evaluate_in(
 
 def record(
     target: PolicyBundle | RecurrentPolicy | Scripted,
-    scenario: str | Path,
+    scenario: ScenarioLike,
     condition: Condition | Planned,
     episodes: range,
     seed: int,
@@ -175,10 +184,54 @@ def record(
 
     run = _Run(env, _team(target, env), condition, seed, recorder=recorder)
     run.evaluation(episodes)
-    return sorted(run.frames, key=lambda frames: frames.episode)
+    return sorted(run.recorded, key=lambda frames: frames.episode)
 
 
-def _team(target: PolicyBundle | RecurrentPolicy | Scripted, env: Env) -> Team:
+def record_pictures(
+    target: PolicyBundle | RecurrentPolicy | Scripted,
+    scenario: ScenarioLike,
+    condition: Condition | Planned,
+    episode: int,
+    seed: int,
+) -> Pictures:
+    """As ``record``, of one episode of a pettingzoo: environment, which draws itself.
+
+    Raises:
+        UserError: as ``evaluate``, or the environment does not draw itself.
+    """
+    # Imported here: nothing else needs what draws.
+    from sim_pkg.foreign.pictures import PictureRecorder, Pictures
+
+    env = make_any_env(scenario, 1, pictures=True)
+    if isinstance(env, Env):
+        raise UserError(f"scenario {env.spec.scenario!r} is no pettingzoo: environment")
+
+    def recorder(arena: int, episode: int) -> PictureRecorder:
+        return PictureRecorder(env, arena, seed, episode)
+
+    run = _Run(env, _team(target, env), condition, seed, recorder=recorder)
+    run.evaluation(range(episode, episode + 1))
+    env.close()
+    (pictures,) = run.recorded
+    assert isinstance(pictures, Pictures)
+    return pictures
+
+
+class EpisodeRecorder(Protocol):
+    """Keeps what can be drawn of an arena's episode."""
+
+    def step(
+        self, intents: IntArray, actions: IntArray, faults: npt.NDArray[np.uint8], reward: float
+    ) -> None:
+        """After a control step. (n,) wanted and executed actions, and codes of faults in force."""
+        ...
+
+    def finish(self, success: bool, trajectory_hash: str) -> Any:
+        """What was kept, when the episode has ended."""
+        ...
+
+
+def _team(target: PolicyBundle | RecurrentPolicy | Scripted, env: ConfiguredEnv) -> Team:
     if isinstance(target, Scripted):
         return ScriptedTeam(make_scripted(target.name, env), env)
     if isinstance(target, PolicyBundle):
@@ -197,7 +250,7 @@ class _Run:
         condition: Condition | Planned,
         seed: int,
         effects: list[EffectRow] | None = None,
-        recorder: Callable[[int, int], Recorder] | None = None,
+        recorder: Callable[[int, int], EpisodeRecorder] | None = None,
     ) -> None:
         self._env = env
         self._team = team
@@ -210,8 +263,8 @@ class _Run:
         self._courses: dict[int, CourseHash] = {}
         self._faulted = np.zeros((env.n_arenas, env.spec.n_robots), dtype=np.bool_)
         self._recorder = recorder
-        self._recorders: dict[int, Recorder] = {}  # by arena, where a recorder was given
-        self.frames: list[Frames] = []  # of the episodes that have ended
+        self._recorders: dict[int, EpisodeRecorder] = {}  # by arena, where a recorder was given
+        self.recorded: list[Any] = []  # what the recorders kept of the episodes that have ended
 
     def evaluation(self, episodes: range) -> Evaluation:
         """Plays and sums up."""
@@ -235,6 +288,7 @@ class _Run:
             tuple(results),
             tuple(sorted(self._effects or ())),
             self._condition.drawn,
+            self._env.spec.reports_success,
         )
 
     def _start(self, arenas: ArenaArray, waiting: list[int]) -> None:
@@ -277,7 +331,7 @@ class _Run:
         success = bool(done.result.success[arena])
         trajectory_hash = self._hashes[arena].hexdigest()
         if arena in self._recorders:
-            self.frames.append(self._recorders.pop(arena).finish(success, trajectory_hash))
+            self.recorded.append(self._recorders.pop(arena).finish(success, trajectory_hash))
         return EpisodeResult(
             episode=int(self._arenas.episodes[arena]),
             success=success,

@@ -10,20 +10,20 @@ from itertools import pairwise
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
-from pathlib import Path
 from typing import NamedTuple
 
 from crash_coach_common.contract import UserError
 from policy_pkg.checkpoint import PolicyBundle
 from policy_pkg.play.conditions import Condition
 from policy_pkg.play.evaluate import Evaluation, Scripted, evaluate
+from sim_pkg.env import ScenarioLike
 
 
 class _Task(NamedTuple):
     """What every process plays, of its own episodes."""
 
     team: PolicyBundle | Scripted
-    scenario: str | Path
+    scenario: ScenarioLike
     conditions: Sequence[Condition]
     seed: int
 
@@ -37,7 +37,7 @@ class _Task(NamedTuple):
 def evaluate_on(
     processes: int,
     team: PolicyBundle | Scripted,
-    scenario: str | Path,
+    scenario: ScenarioLike,
     conditions: Sequence[Condition],
     episodes: int,
     seed: int,

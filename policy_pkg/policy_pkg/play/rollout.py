@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from crash_coach_common.contract import BatchEnv, FloatArray, IntArray, StepResult
+from crash_coach_common.contract import BatchEnv, FloatArray, IntArray, StepResult, UserError
 from crash_coach_pkg.faults.action_tools import UNTOLD
 from crash_coach_pkg.plan import CrashPlan, Fault, Trigger, TriggerKind
 from policy_pkg.act import Explorer
@@ -177,8 +177,14 @@ class Rollout:
         steps = arrays["steps"]
         plans = [None if p is None else plan_from_json(p) for p in values["plans"]]
         running = [plan if at >= 0 else None for plan, at in zip(plans, steps, strict=True)]
-        self._replay(steps, running, arrays["intents"], arrays["worst"])
-        if not np.array_equal(self._env.obs[steps >= 0], arrays["obs"][steps >= 0]):
+        try:
+            self._replay(steps, running, arrays["intents"], arrays["worst"])
+            same = np.array_equal(self._env.obs[steps >= 0], arrays["obs"][steps >= 0])
+        except UserError:
+            raise
+        except ValueError:  # an action that was available then is not now
+            same = False
+        if not same:
             raise CheckpointError(
                 f"scenario {self._env.spec.scenario!r} does not repeat the episodes under way in "
                 "this checkpoint: it was changed, or this is another version or machine type"

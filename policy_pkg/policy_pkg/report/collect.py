@@ -8,7 +8,7 @@ from pathlib import Path
 
 from policy_pkg.checkpoint import AGENT, BEST, CHECKPOINTS, MANIFEST, list_checkpoints
 from policy_pkg.report.finished_runs import steps_of, wanted_steps
-from policy_pkg.train.run_dir import METRICS, RUN, TIMING, RunError, read_run
+from policy_pkg.train.run_dir import METRICS, RUN, SCENARIO, TIMING, RunError, read_run
 
 AGENT_FILES = (f"{AGENT}.safetensors", MANIFEST)
 
@@ -16,8 +16,8 @@ AGENT_FILES = (f"{AGENT}.safetensors", MANIFEST)
 def collect(run: Path, results: Path) -> str | None:
     """Copies what a report and an evaluation need of a finished run to ``results``/<its name>.
 
-    That is run.json, the metrics and the timing (compressed), the last agent and the best one,
-    where the run kept it: some 100 kB.
+    That is run.json, the scenario, the metrics and the timing (compressed), the last agent and the
+    best one, where the run kept it: some 100 kB.
     A copy made before is replaced.
 
     Returns:
@@ -43,6 +43,8 @@ def collect(run: Path, results: Path) -> str | None:
         for name in AGENT_FILES:
             shutil.copyfile(kept_agent / name, agent / name)
     shutil.copyfile(run / RUN, partial / RUN)
+    if (run / SCENARIO).is_dir():
+        shutil.copytree(run / SCENARIO, partial / SCENARIO)
     for name in (METRICS, TIMING):
         if (run / name).is_file():
             packed = gzip.compress((run / name).read_bytes(), mtime=0)

@@ -29,9 +29,21 @@ from policy_pkg.checkpoint import (
 )
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.offline.config import OfflineConfig
-from policy_pkg.train.run_dir import METRICS, RUN, TIMING, RunError, flat, read_run, seedless_name
+from policy_pkg.train.run_dir import (
+    LENGTHS,
+    METRICS,
+    RUN,
+    TIMING,
+    RunError,
+    flat,
+    is_current,
+    kept_scenario,
+    read_run,
+    seedless_name,
+)
+from sim_pkg.env import ScenarioLike
+from sim_pkg.scenario_source import ScenarioSource, short_name
 
-LENGTHS = ("total_steps", "gradient_steps")  # of a run: trained in the simulator, or offline
 NO_SETTING = {
     *("scenario", "seed", *LENGTHS),
     *("tensorboard", "checkpoint_interval_steps", "checkpoint_replay"),
@@ -42,7 +54,8 @@ NO_SETTING = {
 class Run:
     """A run and the checkpoint of it that acts; ``agent``: SHA-256 of that one's weights.
 
-    ``settings``: what its method consists of. ``steps``: how far the run has come.
+    ``settings``: what its method consists of. ``steps``: how far the run has come. ``source``: what
+    to make its environment of: the scenario's name, or the copy that the run keeps.
     """
 
     path: Path
@@ -54,6 +67,7 @@ class Run:
     steps: int
     total_steps: int
     agent: str
+    source: ScenarioLike
 
     @property
     def finished(self) -> bool:
@@ -110,9 +124,11 @@ def read_runs(paths: Iterable[Path]) -> list[Run]:
 
     Raises:
         CheckpointError: a run without a checkpoint, or a damaged one.
-        RunError: a damaged run.json; one name for two settings; the same run twice.
+        RunError: a damaged run.json; one name for two settings; the same run twice; a scenario
+            that was changed between two runs.
     """
     runs = [_read(path) for path in paths]
+    _check_scenarios(runs)
     reason = _clash(runs)
     if reason is None:
         return runs
@@ -120,6 +136,22 @@ def read_runs(paths: Iterable[Path]) -> list[Run]:
     if _clash(longer):
         raise RunError(reason)
     return longer
+
+
+def _check_scenarios(runs: Iterable[Run]) -> None:
+    seen: dict[str, Run] = {}
+    for run in runs:
+        other = seen.setdefault(run.scenario, run)
+        if _content(other) != _content(run):
+            raise RunError(
+                f"{other.path} and {run.path} were both trained on {run.scenario}, but its file "
+                "was changed between them: their results cannot stand in one table"
+            )
+
+
+def _content(run: Run) -> str | None:
+    """What tells a copy of the scenario from its name's meaning here and now, which is None."""
+    return run.source.sha256 if isinstance(run.source, ScenarioSource) else None
 
 
 def _read(given: Path) -> Run:
@@ -136,6 +168,7 @@ def _read(given: Path) -> Run:
     manifest = read_manifest(checkpoint)
     if AGENT not in manifest.files:
         raise RunError(f"{checkpoint / MANIFEST} lists no {AGENT}.safetensors")
+    kept = kept_scenario(path)
     settings = {key: value for key, value in config.items() if key not in NO_SETTING}
     made = [*list_checkpoints(path / BEST), *list_checkpoints(path / CHECKPOINTS)]
     return Run(
@@ -148,6 +181,7 @@ def _read(given: Path) -> Run:
         steps=max(map(steps_of, made)),
         total_steps=wanted_steps(config),
         agent=manifest.files[AGENT].sha256,
+        source=manifest.scenario if kept is None or is_current(kept) else kept,
     )
 
 
@@ -166,7 +200,7 @@ def method_name(path: Path, scenario: str, settings: Mapping[str, Any]) -> str:
     ``adaptive-s0`` and ``3m-adaptive-s0`` on skirmish/3m are both "adaptive"; ``3m-s0`` is
     "qmix", or with a coach "qmix, adaptive".
     """
-    arena = re.escape(Path(scenario).name.removesuffix(".yaml"))
+    arena = re.escape(short_name(scenario))
     name = re.sub(rf"(^|[-_.]){arena}(?=$|[-_.])", "", seedless_name(path)).strip("-_.")
     if name:
         return name

@@ -18,7 +18,7 @@ from policy_pkg.report.finished_runs import Run
 from policy_pkg.report.training import Training, training_of
 from policy_pkg.statistics import Estimate, wilson
 from policy_pkg.train.run_dir import RunError
-from sim_pkg.env import make_env
+from sim_pkg.env import ScenarioLike, make_any_env
 
 FORMAT = 3  # of what is kept; a new number makes everything be played again
 
@@ -119,7 +119,7 @@ class Evaluations:
         about = {
             "format": FORMAT,
             "agent": run.agent,
-            "scenario": arena(run.scenario)[1],
+            "scenario": arena(run.source)[1],
             "crash": condition.crash.model_dump(mode="json"),
             "episodes": self.episodes,
             "seed": self.seed,
@@ -129,7 +129,12 @@ class Evaluations:
     def _play(self, run: Run, condition: Condition) -> Outcome:
         bundle = load_policy(run.checkpoint)
         key = evaluation_seed(self.seed)
-        found = evaluate(bundle, run.scenario, condition, self.episodes, key)
+        found = evaluate(bundle, run.source, condition, self.episodes, key)
+        if not found.reports_success:
+            raise RunError(
+                f"{run.path}: scenario {run.scenario!r} reports no success, which a report "
+                "compares: train with env_rules.success_return or env_rules.success_info"
+            )
         figures = found.summary()
         return Outcome(
             successes=sum(episode.success for episode in found.episodes),
@@ -142,13 +147,13 @@ class Evaluations:
 
 
 @cache
-def arena(scenario: str) -> tuple[tuple[str, ...], str]:
+def arena(scenario: ScenarioLike) -> tuple[tuple[str, ...], str]:
     """A scenario's robots, and its settings as JSON.
 
     Raises:
         ConfigError: unknown or wrong scenario.
     """
-    env = make_env(scenario, 1)
+    env = make_any_env(scenario, 1)
     return env.spec.robots, env.config.model_dump_json()
 
 

@@ -153,7 +153,7 @@ def _measured(group: Sequence[Result], index: int) -> Row:
 
 
 def _reweighted(group: Sequence[Result], rate: float) -> Row:
-    n = len(arena(group[0].run.scenario)[0])
+    n = len(arena(group[0].run.source)[0])
     single, missing = [], 0.0
     for result in group:
         exact = {

@@ -34,7 +34,8 @@ from policy_pkg.train.config import (
     load_train_tree,
     with_settings,
 )
-from sim_pkg.env import make_env
+from sim_pkg.env import make_any_env
+from sim_pkg.scenario_source import ScenarioSource, short_name
 
 FULL = "full"
 METHOD_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
@@ -231,8 +232,7 @@ class _Expansion:
             Setting("scenario", scenario, self._where_of("scenarios", scenario)),
             Setting("seed", seed, self._where_of("seeds", seed)),
         ]
-        tail = scenario.split("/")[-1].removesuffix(".yaml").removesuffix(".yml")
-        name = f"{tail}/{method}-s{seed}"
+        name = f"{short_name(scenario)}/{method}-s{seed}"
         config = validate(with_settings(self._base, [*settings, *own]), TrainConfig)
         try:
             check_fits(config)
@@ -257,7 +257,7 @@ class _Expansion:
 
 def check_fits(config: TrainConfig) -> None:
     """Raises UserError where the scenario is unknown, or the coach's settings do not fit it."""
-    spec = _spec(config.scenario)
+    spec = _spec(config.scenario_source())
     coach = Coach(config.coach, TeamSpec.of(spec), config.seed)
     if coach.needs_success and not spec.reports_success:
         raise ConfigError(
@@ -267,8 +267,8 @@ def check_fits(config: TrainConfig) -> None:
 
 
 @cache
-def _spec(scenario: str) -> EnvSpec:
-    return make_env(scenario, 1).spec
+def _spec(scenario: ScenarioSource) -> EnvSpec:
+    return make_any_env(scenario, 1).spec
 
 
 def _check_scenarios(

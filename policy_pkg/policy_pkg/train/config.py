@@ -23,6 +23,8 @@ from crash_coach_common.strict_yaml import (
 from crash_coach_pkg.coach.config import CoachConfig
 from policy_pkg.learner.config import LearnerConfig
 from policy_pkg.learner.strata import Strata
+from sim_pkg.foreign.config import EnvRules
+from sim_pkg.scenario_source import NO_RULES, ScenarioSource, read_scenario
 
 CONFIGS_DIR = Path(__file__).parent.parent / "configs"
 OFFLINE = "offline"  # its folder is that of `train-offline`
@@ -38,7 +40,20 @@ class TrainConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    scenario: str = Field(description="shipped scenario's name, or path of a .yaml file")
+    scenario: str = Field(
+        description="shipped scenario's name, path of a .yaml file, or "
+        "pettingzoo:PACKAGE.MODULE:FACTORY"
+    )
+    env_args: dict[str, Any] = Field(
+        {},
+        exclude_if=lambda args: not args,
+        description="of a pettingzoo: scenario: keyword arguments of its factory",
+    )
+    env_rules: EnvRules = Field(
+        NO_RULES,
+        exclude_if=lambda rules: rules == NO_RULES,
+        description="of a pettingzoo: scenario: what it does not say of itself",
+    )
     seed: int = Field(0, ge=0, lt=2**63, description="keys everything that is drawn")
     total_steps: int = Field(2_000_000, ge=1, description="environment steps, all arenas counted")
     n_envs: int = Field(8, ge=1, le=4096, description="arenas that run side by side")
@@ -101,6 +116,10 @@ class TrainConfig(BaseModel):
                 f"epsilon_finish {self.epsilon_finish} is above epsilon_start {self.epsilon_start}"
             )
         return self
+
+    def scenario_source(self) -> ScenarioSource:
+        """Raises ConfigError where the scenario is unknown or takes no env_args."""
+        return read_scenario(self.scenario, self.env_args, self.env_rules)
 
     def epsilon(self, env_steps: int) -> float:
         """Linear from ``epsilon_start`` to ``epsilon_finish``, then constant."""

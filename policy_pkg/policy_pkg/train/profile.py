@@ -155,10 +155,11 @@ class _Meter:
     def open(self, session: TrainSession) -> None:
         self._session = session
         env = session.env
-        assert isinstance(env, Env)  # as ``train`` makes it
         watch = self.stopwatch.watch
+        if isinstance(env, Env):
+            for method in ("advance", "place", "take_out"):
+                watch(env.world, method, PHYSICS)
         for owner, part, methods in (
-            (env.world, PHYSICS, ("advance", "place", "take_out")),
             (env, SIMULATOR, ("step", "reset")),
             (session.policy, INFERENCE, ("forward", "set_weights")),
             (session.rollout, ROLLOUT, ("step",)),

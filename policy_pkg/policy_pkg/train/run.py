@@ -24,14 +24,15 @@ from policy_pkg.learner.learner import DivergedError
 from policy_pkg.learner.threads import use_one_thread
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.metrics import Logged, RunLog, Value
-from policy_pkg.train.run_dir import RunConfig, locked, prepare_run
+from policy_pkg.train.run_dir import RunConfig, extend_run, kept_scenario, locked, prepare_run
 from policy_pkg.train.session import TEST_ARENAS, TrainSession
 from policy_pkg.train.snapshot import Saved, restore, save, save_best
-from sim_pkg.env import make_env
+from sim_pkg.env import ScenarioLike, make_any_env
+from sim_pkg.scenario_source import ScenarioSource
 
 Phase = Literal["training", "evaluation", "checkpoint", "finished"]
 Clock = Callable[[], float]
-MakeEnv = Callable[[str | Path, int], BatchEnv]
+MakeEnv = Callable[[ScenarioLike, int], BatchEnv]
 
 REPORT_INTERVAL_S = 0.2
 SPEED_WINDOW_S = 10.0
@@ -144,7 +145,7 @@ def train(
     resume: bool = False,
     progress: OnProgress = silent,
     clock: Clock = time.perf_counter,
-    environment: MakeEnv = make_env,
+    environment: MakeEnv = make_any_env,
     opened: Callable[[TrainSession], None] = lambda session: None,
 ) -> RunSummary:
     """Trains until ``config.total_steps`` on episodes that are played in this process.
@@ -161,10 +162,11 @@ def train(
         UserError: the config does not fit the scenario, ``out_dir`` cannot be used, a checkpoint
             is damaged, training diverged, or the result could not be written.
     """
-    env = environment(config.scenario, config.n_envs)
-    test_env = environment(config.scenario, min(TEST_ARENAS, config.test_episodes))
+    scenario = (kept_scenario(out_dir) if resume else None) or config.scenario_source()
+    env = environment(scenario, config.n_envs)
+    test_env = environment(scenario, min(TEST_ARENAS, config.test_episodes))
     session = TrainSession(config, env, test_env)
-    with Run(session, out_dir, resume, progress, clock) as run:
+    with Run(session, out_dir, resume, progress, clock, scenario=scenario) as run:
         opened(session)
         return run.go()
 
@@ -177,6 +179,7 @@ class Run:
         warnings: what the user should know before the first step.
         on_block: told a block's line once it is written, before what follows.
         stopped: asked between steps whether to end early, as the last checkpoint leaves it.
+        scenario: what a new run keeps a copy of.
 
     Raises:
         UserError: on entering: ``out_dir`` cannot be used, or a checkpoint is damaged.
@@ -193,8 +196,10 @@ class Run:
         warnings: Sequence[str] = (),
         on_block: Callable[[dict[str, Value]], None] = _untold,
         stopped: Callable[[], bool] = lambda: False,
+        scenario: ScenarioSource | None = None,
     ) -> None:
         self._session, self._out_dir, self._resume, self._data = session, out_dir, resume, data
+        self._scenario = scenario
         self._progress, self._clock = progress, clock
         self._on_block, self._stopped = on_block, stopped
         self._warnings = deque(warnings)
@@ -203,9 +208,10 @@ class Run:
     def __enter__(self) -> Self:
         use_one_thread()
         session, out_dir = self._session, self._out_dir
-        prepare_run(out_dir, session.config, self._resume, self._data)
+        prepare_run(out_dir, session.config, self._resume, self._data, self._scenario)
         with ExitStack() as held:
             held.enter_context(locked(out_dir))
+            extend_run(out_dir, session.config)
             found = list_checkpoints(out_dir / CHECKPOINTS)
             self._checkpoint = found[-1] if found else None
             logged = restore(found[-1], session) if found else Logged()

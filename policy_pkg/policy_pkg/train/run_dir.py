@@ -3,6 +3,7 @@
 ::
 
     run.json          config, seed, versions, commit, command line: all it takes to repeat the run
+    scenario/         the scenario as it was when the run began (see sim_pkg.scenario_source)
     metrics.jsonl     one line per evaluation block (see metrics)
     timing.jsonl      the clock's figures of the same blocks
     checkpoints/step_000100000/
@@ -21,21 +22,27 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from crash_coach_common.contract import UserError
-from policy_pkg.checkpoint import CHECKPOINTS
+from crash_coach_common.strict_yaml import ConfigError
+from policy_pkg.checkpoint import CHECKPOINTS, PolicyBundle
 from policy_pkg.kernels import kernels
 from policy_pkg.learner import native
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.offline.config import OfflineConfig
+from sim_pkg.env import ScenarioLike
+from sim_pkg.scenario_source import ScenarioSource, read_scenario
 
 RUN = "run.json"
 METRICS = "metrics.jsonl"
 TIMING = "timing.jsonl"
 TENSORBOARD = "tensorboard"
+SCENARIO = "scenario"
+LENGTHS = ("total_steps", "gradient_steps")  # of a run: trained in the simulator, or offline
 FORMAT = "crash-coach-run"
 RunConfig = TrainConfig | OfflineConfig
 LIBRARIES = ("numpy", "torch", "pymunk", "numba")
@@ -46,11 +53,17 @@ class RunError(UserError):
 
 
 def prepare_run(
-    out_dir: Path, config: RunConfig, resume: bool, data: dict[str, Any] | None = None
+    out_dir: Path,
+    config: RunConfig,
+    resume: bool,
+    data: dict[str, Any] | None = None,
+    scenario: ScenarioSource | None = None,
 ) -> None:
     """Makes ``out_dir`` a run of ``config``; with ``resume``, one that is there already will do.
 
-    data: describes the data set of an offline run, by its ``sha256`` among others.
+    Args:
+        data: describes the data set of an offline run, by its ``sha256`` among others.
+        scenario: what a new run keeps a copy of.
 
     Raises:
         RunError: it holds a run and ``resume`` is off; that run has another config (the text
@@ -64,15 +77,81 @@ def prepare_run(
         check_same(run, config, out_dir)
         _check_same_data(run, data, out_dir)
         return
-    # A .partial file is what a killed process leaves.
-    if out_dir.is_dir() and any(p.suffix != ".partial" for p in out_dir.iterdir()):
+    # A process that was killed right here leaves .partial files and the scenario.
+    if out_dir.is_dir() and any(
+        p.suffix != ".partial" and p.name != SCENARIO for p in out_dir.iterdir()
+    ):
         raise RunError(f"{out_dir} is not empty and holds no run: choose another directory")
     if out_dir.exists() and not out_dir.is_dir():
         raise RunError(f"{out_dir} is a file: choose another directory")
     out_dir.mkdir(parents=True, exist_ok=True)
-    partial = described.with_name(RUN + ".partial")
-    partial.write_text(json.dumps(describe_run(config, data), indent=1) + "\n", encoding="utf-8")
-    partial.rename(described)
+    about = describe_run(config, data)
+    if scenario is not None:
+        file = scenario.write(out_dir / SCENARIO).relative_to(out_dir)
+        about["scenario"] = {
+            "name": scenario.name,
+            "file": file.as_posix(),
+            "sha256": scenario.sha256,
+        }
+    _write_run(out_dir, about)
+
+
+def _write_run(out_dir: Path, about: Mapping[str, Any]) -> None:
+    partial = out_dir / (RUN + ".partial")
+    partial.write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+    partial.rename(out_dir / RUN)
+
+
+def kept_scenario(out_dir: Path) -> ScenarioSource | None:
+    """The scenario as it was when the run began; None where none is kept: no run, or an old one.
+
+    Raises:
+        RunError: the copy is missing or was changed.
+    """
+    if not (out_dir / RUN).is_file():
+        return None
+    told = read_run(out_dir).get("scenario")
+    if told is None:
+        return None
+    try:
+        source = read_scenario(out_dir / told["file"])
+    except ConfigError as error:
+        raise RunError(f"{out_dir / RUN} keeps a scenario that is not there: {error}") from error
+    if source.sha256 != told["sha256"]:
+        raise RunError(
+            f"{out_dir / told['file']} is not the scenario that this run was trained on: it was "
+            "changed (its sha256 differs): name one with --scenario, or restore the file"
+        )
+    return replace(source, name=told["name"])
+
+
+def run_of(checkpoint: Path) -> Path:
+    """The run directory that a checkpoint's folder lies in, if it does."""
+    return checkpoint.resolve().parent.parent
+
+
+def scenario_of(bundle: PolicyBundle) -> ScenarioLike:
+    """What a policy was trained on: its name where that still means the same, otherwise the copy.
+
+    Raises:
+        RunError: the run's copy is damaged.
+    """
+    kept = kept_scenario(run_of(bundle.path))
+    return bundle.scenario if kept is None or is_current(kept) else kept
+
+
+def is_current(kept: ScenarioSource) -> bool:
+    """Whether its name stands for the same here and now, with nothing else to know."""
+    now = found_now(kept)
+    return now is not None and now.sha256 == kept.sha256
+
+
+def found_now(kept: ScenarioSource) -> ScenarioSource | None:
+    """What its name stands for here and now; None: nothing."""
+    try:
+        return read_scenario(kept.name)
+    except ConfigError:
+        return None
 
 
 def read_run(out_dir: Path) -> dict[str, Any]:
@@ -124,16 +203,33 @@ def _commit() -> str | None:
 
 
 def check_same(run: Mapping[str, Any], config: RunConfig, out_dir: Path) -> None:
-    """Raises RunError where ``out_dir``, which ``run`` describes, was not begun with ``config``."""
+    """Raises RunError where ``out_dir``, which ``run`` describes, was not begun with ``config``.
+
+    A run may be made longer than it was meant to be, see ``extend_run``.
+    """
     before = flat(run.get("config", {}))
     now = flat(config.model_dump(mode="json"))
     for key in sorted({*before, *now}):
         old, new = before.get(key, "nothing"), now.get(key, "nothing")
+        if key in LENGTHS and isinstance(old, int) and isinstance(new, int) and new > old:
+            continue
         if old != new:
             raise RunError(
                 f"{out_dir} was started with {key} = {old!r}, not {new!r}: "
                 "a run is resumed with the config it was started with"
             )
+
+
+def extend_run(out_dir: Path, config: RunConfig) -> None:
+    """Notes in ``run.json`` that the run is to be longer, where it is; only for who holds it."""
+    run = read_run(out_dir)
+    now = config.model_dump(mode="json")
+    for key in LENGTHS:
+        before = run["config"].get(key)
+        if key in now and before != now[key]:
+            run.setdefault("extended", []).append({key: before})
+            run["config"][key] = now[key]
+            _write_run(out_dir, run)
 
 
 def _check_same_data(run: dict[str, Any], data: dict[str, Any] | None, out_dir: Path) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import imageio_ffmpeg
 import numpy as np
@@ -17,6 +17,7 @@ from matplotlib.collections import EllipseCollection, LineCollection, PolyCollec
 from PIL import Image
 
 from crash_coach_common.whole_output import whole_output
+from sim_pkg.foreign.pictures import Picture, PictureFilm, Pictures
 from sim_pkg.render.frames import Frames, Side
 from sim_pkg.render.stage import (
     CRASHED,
@@ -45,10 +46,21 @@ LAST_S = 1.5  # how long the end is shown
 _TRAIL_S = 4.0
 _FADED = 0.25
 
-Picture = npt.NDArray[np.uint8]
+
+class Film(Protocol):
+    """Pictures by their time."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels, both even."""
+        ...
+
+    def picture(self, at: float) -> Picture:
+        """(H, W, 3) at a time in control steps."""
+        ...
 
 
-def write_video(frames: Frames, path: Path, speed: float = 1.0) -> None:
+def write_video(frames: Frames | Pictures, path: Path, speed: float = 1.0) -> None:
     """Writes ``path``, a .mp4 (H.264) or .gif by its suffix; it is complete or not there.
 
     Args:
@@ -65,11 +77,12 @@ def write_video(frames: Frames, path: Path, speed: float = 1.0) -> None:
         raise ValueError(f"{path}: a film is a .mp4 or .gif file")
     write, fps = writers[path.suffix]
     path.parent.mkdir(parents=True, exist_ok=True)
+    film = PictureFilm(frames) if isinstance(frames, Pictures) else _Film(frames)
     with whole_output(path) as temporary:
-        write(_Film(frames), _times(frames, fps, speed), temporary)
+        write(film, _times(frames, fps, speed), temporary)
 
 
-def _write_mp4(film: _Film, times: npt.NDArray[np.float64], path: Path) -> None:
+def _write_mp4(film: Film, times: npt.NDArray[np.float64], path: Path) -> None:
     # One thread and no dates, so that the same episode gives the same file.
     same = ["-threads", "1", "-fflags", "+bitexact", "-flags:v", "+bitexact"]
     quality = ["-preset", "veryfast", "-crf", "20", "-movflags", "+faststart"]
@@ -83,7 +96,7 @@ def _write_mp4(film: _Film, times: npt.NDArray[np.float64], path: Path) -> None:
     encoder.close()
 
 
-def _write_gif(film: _Film, times: npt.NDArray[np.float64], path: Path) -> None:
+def _write_gif(film: Film, times: npt.NDArray[np.float64], path: Path) -> None:
     # One palette for all pictures, from the first, the last and those between.
     some = np.linspace(0, len(times) - 1, 5).astype(int)
     sheet = Image.fromarray(np.concatenate([_shrunk(film.picture(times[k])) for k in some]))
@@ -106,7 +119,7 @@ def _shrunk(picture: Picture) -> Picture:
     return np.asarray(image.resize(size, Image.Resampling.LANCZOS))
 
 
-def _times(frames: Frames, fps: int, speed: float) -> npt.NDArray[np.float64]:
+def _times(frames: Frames | Pictures, fps: int, speed: float) -> npt.NDArray[np.float64]:
     """The time of each picture, in control steps."""
     per_picture = speed / (fps * frames.dt_s)
     count = int(np.ceil(frames.steps / per_picture)) + round(LAST_S * fps) + 1

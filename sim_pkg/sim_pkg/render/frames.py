@@ -56,6 +56,11 @@ class Frames:
         return crashed
 
     @property
+    def robots(self) -> tuple[str, ...]:
+        """Their names."""
+        return tuple(actor.name for actor in self.actors[: self.n_robots])
+
+    @property
     def alive(self) -> BoolArray:
         """(T+1, d)"""
         alive: BoolArray = self.health > 0

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from crash_coach_common.contract import (
+    BatchEnv,
     BoolArray,
     EnvSpec,
     EpisodeArray,
@@ -24,7 +25,6 @@ from crash_coach_common.contract import (
     stay_action,
 )
 from crash_coach_common.strict_yaml import ConfigError, StrictModel, did_you_mean
-from sim_pkg.env import Env
 
 # Keeps a policy's random numbers apart from the environment's of the same (seed, episode).
 _STREAM = 0x5C819ED
@@ -61,7 +61,14 @@ class Entry:
     build: Callable[[EnvSpec, Any, int], ScriptedPolicy]
 
 
-def make_scripted(name: str, env: Env) -> ScriptedPolicy:
+class ConfiguredEnv(BatchEnv, Protocol):
+    """An environment that was built from a scenario's configuration."""
+
+    @property
+    def config(self) -> StrictModel: ...
+
+
+def make_scripted(name: str, env: ConfiguredEnv) -> ScriptedPolicy:
     """The policy ``name`` for as many arenas as ``env`` has.
 
     Raises:
@@ -80,7 +87,7 @@ def make_scripted(name: str, env: Env) -> ScriptedPolicy:
     return REGISTRY[name].build(env.spec, env.config, env.n_arenas)
 
 
-def scripted_names(env: Env) -> tuple[str, ...]:
+def scripted_names(env: ConfiguredEnv) -> tuple[str, ...]:
     """The policies that can play ``env``, sorted."""
     return tuple(sorted(n for n, entry in REGISTRY.items() if isinstance(env.config, entry.fits)))
 

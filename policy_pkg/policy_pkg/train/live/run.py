@@ -26,7 +26,7 @@ ORDERS: dict[Mode, type[Order]] = {"lockstep": Lockstep, "realtime": RealTime}
 
 def load_spec(config: TrainConfig) -> EnvSpec:
     """The team's. Raises ConfigError where the scenario is unknown or wrong."""
-    return make_env(config.scenario, 1).spec
+    return make_env(config.scenario_source(), 1).spec
 
 
 def reads_blocks(config: TrainConfig) -> bool:
@@ -72,6 +72,7 @@ class LiveRun:
             *(self.session, out_dir, resume, self._tell, clock),
             on_block=self._block_written,
             stopped=self._stop.is_set,
+            scenario=config.scenario_source(),
         )
         self._threads = ThreadPoolExecutor(1, thread_name_prefix="learning")
         self._learning: Future[None] | None = None

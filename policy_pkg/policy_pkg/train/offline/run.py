@@ -12,8 +12,10 @@ from policy_pkg.train.offline.config import OfflineConfig
 from policy_pkg.train.offline.data import FixedData, Recorded, load_data
 from policy_pkg.train.offline.session import OfflineSession
 from policy_pkg.train.run import Clock, MakeEnv, OnProgress, Run, RunSummary, silent
+from policy_pkg.train.run_dir import kept_scenario
 from policy_pkg.train.session import TEST_ARENAS
 from sim_pkg.env import make_env
+from sim_pkg.scenario_source import read_scenario
 
 
 def read_data(
@@ -54,10 +56,13 @@ def train_offline(
             a checkpoint is damaged, training diverged, or the result could not be written.
     """
     arenas = min(TEST_ARENAS, config.test_episodes)
-    env = None if config.scenario is None else environment(config.scenario, arenas)
+    scenario = kept_scenario(out_dir) if resume else None
+    if scenario is None and config.scenario is not None:
+        scenario = read_scenario(config.scenario)
+    env = None if scenario is None else environment(scenario, arenas)
     session = OfflineSession(config, data, env)
     described, told = describe_data(session, sources), warnings(session)
-    with Run(session, out_dir, resume, progress, clock, described, told) as run:
+    with Run(session, out_dir, resume, progress, clock, described, told, scenario=scenario) as run:
         return run.go()
 
 

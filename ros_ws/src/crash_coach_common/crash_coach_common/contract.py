@@ -34,7 +34,8 @@ class EnvSpec:
     ``stay_actions`` are the scenario's no-move actions in order of preference; in every
     reachable situation at least one of them is available to every robot. ``bounds`` are the
     lowest and highest value that any observation or state feature can take. ``roles`` has one name
-    per robot: faults may be aimed at a role.
+    per robot: faults may be aimed at a role. ``reports_success``, ``reports_positions``: whether
+    ``StepResult.success`` and ``BatchEnv.positions_m`` mean anything.
     """
 
     scenario: str
@@ -48,6 +49,7 @@ class EnvSpec:
     dt_s: float
     bounds: tuple[float, float]
     reports_success: bool = True
+    reports_positions: bool = True
 
     @property
     def n_robots(self) -> int:

@@ -85,12 +85,21 @@ def load_tree(path: Path) -> YamlTree:
     Raises:
         ConfigError: unreadable, not YAML, not a mapping, or a key that occurs twice.
     """
+    return parse_tree(path, read_text(path))
+
+
+def read_text(path: Path) -> str:
+    """Raises ConfigError where the file cannot be read."""
     try:
-        text = path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not UTF-8 text") from error
+
+
+def parse_tree(path: Path, text: str) -> YamlTree:
+    """As ``load_tree``, of what ``path`` holds or would hold."""
     try:
         loader = _Loader(text)
     except yaml.reader.ReaderError as error:

@@ -53,7 +53,7 @@ class Player:
         self._target = target
         self._seed = evaluation_seed(seed)
         self._team = target.team
-        self._scenario = target.scenario
+        self._scenario = target.source
         spec = make_env(self._scenario, 1).spec
         self._action_names = spec.action_names
         self._robots = spec.robots
@@ -61,7 +61,7 @@ class Player:
         self._tallies: dict[str, _Tally] = {}
         self._threads = ThreadPoolExecutor(1, thread_name_prefix="costs")
         self._curves = Curves(Path(target.name))
-        self.title = f"{Path(target.name).name} · {self._scenario}"
+        self.title = f"{Path(target.name).name} · {target.scenario}"
 
     def _film(self, episode: int, crash: CoachConfig) -> Film:
         condition = Condition("console", crash)

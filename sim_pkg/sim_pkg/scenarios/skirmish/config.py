@@ -93,7 +93,8 @@ class PhasesConfig(PhysicsConfig):
 class SkirmishConfig(StrictModel):
     """A map; the shipped ones say what each key means.
 
-    ``unit_types``: the map's own types, next to those of units.yaml.
+    ``unit_types``: the map's own types, next to those of units.yaml. ``standard``: what a
+    units.yaml beside the map says, as in the copy that a run keeps; null: the program's counts.
     """
 
     kind: Literal["skirmish"]
@@ -107,6 +108,12 @@ class SkirmishConfig(StrictModel):
     behaviour: BehaviourConfig
     physics: PhasesConfig
     unit_types: dict[str, UnitConfig] = Field(default_factory=dict)
+    standard: UnitTypes | None = Field(None, exclude_if=lambda units: units is None)
+
+    @property
+    def standard_types(self) -> dict[str, UnitConfig]:
+        """The unit types that are no map's own."""
+        return shipped_units() if self.standard is None else self.standard.unit_types
 
     @property
     def placed(self) -> tuple[PlacedUnit, ...]:
@@ -116,7 +123,7 @@ class SkirmishConfig(StrictModel):
     @property
     def types(self) -> dict[str, UnitConfig]:
         """Every unit type that the map may use."""
-        return shipped_units() | self.unit_types
+        return self.standard_types | self.unit_types
 
     @property
     def units(self) -> tuple[UnitConfig, ...]:
@@ -147,7 +154,7 @@ class SkirmishConfig(StrictModel):
                 f"free_m = {list(self.free_m)}: no rectangle x1, y1, x2, y2 in the arena, "
                 f"which is {self.arena_m[0]:g} x {self.arena_m[1]:g} m",
             )
-        types = shipped_units()
+        types = self.standard_types
         for name in self.unit_types:
             if name in types:
                 raise Misplaced(

@@ -86,6 +86,12 @@ def check_json_target(path: Path | None) -> None:
         check_file_target("--json", path)
 
 
+def tell_note(note: str) -> None:
+    """Prints what the user should know, if there is anything."""
+    if note:
+        console.print(note, markup=False, highlight=False)
+
+
 def table(title: str, columns: list[str]) -> FittedTable:
     """A table whose first column is text and whose others are figures."""
     out = FittedTable(title=title, title_justify="left")

@@ -7,6 +7,7 @@ from pathlib import Path
 from crash_coach_bringup.cli.output import CliError
 from crash_coach_bringup.cli.verbs.evaluate import Layout, Via
 from crash_coach_common.contract import EnvSpec
+from crash_coach_common.strict_yaml import ConfigError
 from crash_coach_pkg.coach.config import TeamSpec
 from crash_coach_pkg.coach.fault_scenario import FaultScenario, ScenarioPlanner
 from crash_coach_pkg.faults.action_tools import ACTION_OFFERS
@@ -14,10 +15,10 @@ from policy_pkg.play.conditions import Planned, crash_free
 from policy_pkg.play.evaluate import Evaluation, Scripted, evaluate, evaluation_seed
 from policy_pkg.play.target import Target
 from policy_pkg.report.verdict import FaultRun, judge_run
-from sim_pkg.env import make_env
+from sim_pkg.env import ScenarioLike, make_any_env
 
 
-def check_scenario(faults: FaultScenario, scenario: str, values: bool = True) -> EnvSpec:
+def check_scenario(faults: FaultScenario, scenario: ScenarioLike, values: bool = True) -> EnvSpec:
     """Holds the file against a scenario; returns what that promises.
 
     Args:
@@ -26,7 +27,12 @@ def check_scenario(faults: FaultScenario, scenario: str, values: bool = True) ->
     Raises:
         ConfigError: unknown or wrong scenario, or faults out of its reach.
     """
-    spec = make_env(scenario, 1).spec
+    spec = make_any_env(scenario, 1).spec
+    if not spec.reports_success:
+        raise ConfigError(
+            f"scenario {spec.scenario!r} reports no success, by which faults are judged: it needs "
+            "success_return or success_info"
+        )
     offered = ACTION_OFFERS if values else ACTION_OFFERS - {"worst"}
     faults.check(TeamSpec.of(spec), spec.episode_limit, offered)
     return spec
@@ -44,15 +50,15 @@ def play(
     scripted = isinstance(target.team, Scripted)
     if via is Via.ros and scripted:
         raise CliError(f"--via ros: {target.name} has no nodes; scripted teams play in the core")
-    spec = check_scenario(faults, target.scenario, values=not scripted)
+    spec = check_scenario(faults, target.source, values=not scripted)
     seed = evaluation_seed(seed)
     planner = ScenarioPlanner(faults, TeamSpec.of(spec), seed)
     if via is Via.ros:
         faulted, free = _play_via_ros(faults, target, episodes, seed, layout)
     else:
         planned = Planned(faults.path.stem, lambda team, key: ScenarioPlanner(faults, team, key))
-        faulted = evaluate(target.team, target.scenario, planned, episodes, seed, effects=True)
-        free = evaluate(target.team, target.scenario, crash_free(), episodes, seed)
+        faulted = evaluate(target.team, target.source, planned, episodes, seed, effects=True)
+        free = evaluate(target.team, target.source, crash_free(), episodes, seed)
     return judge_run(faults, planner, faulted, free)
 
 
@@ -62,9 +68,7 @@ def _play_via_ros(
     from crash_coach_bringup.ros.evaluation import evaluate_via_ros
 
     faulted, free = (
-        evaluate_via_ros(
-            Path(target.name), target.scenario, condition, episodes, seed, layout.value
-        )
+        evaluate_via_ros(Path(target.name), target.file, condition, episodes, seed, layout.value)
         for condition in (faults.path, crash_free())
     )
     return faulted, free

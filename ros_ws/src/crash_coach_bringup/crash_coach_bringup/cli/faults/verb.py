@@ -19,6 +19,7 @@ from crash_coach_bringup.cli.output import (
     console,
     done_first,
     table,
+    tell_note,
     write_file,
 )
 from crash_coach_bringup.cli.verbs.evaluate import (
@@ -85,6 +86,7 @@ def run_verb(
     if out is not None:
         check_target(out)
     target = load_target(policy, scenario or faults.config.scenario)
+    tell_note(target.note)
     began, start_s = datetime.now(UTC), time.monotonic()
     run = play(faults, target, episodes, seed, via, layout)
     played = Played(

@@ -145,8 +145,8 @@ def report(
     runs, waiting = _begun(find_runs(folders))
     _check_methods(against or [], runs)
     wanted = {
-        name: asked(arena(name)[0], crashed, crash_rate, each_robot, mode, parameters)
-        for name in dict.fromkeys(run.scenario for run in runs)
+        run.scenario: asked(arena(run.source)[0], crashed, crash_rate, each_robot, mode, parameters)
+        for run in runs
     }
     exact = any(c.crashed is not None for found in wanted.values() for c in found)
     rates = crash_rate or ([] if crashed or each_robot else RATES)

@@ -24,6 +24,7 @@ from crash_coach_bringup.cli.output import (
     percent_ci,
     points,
     table,
+    tell_note,
     written_first,
 )
 from policy_pkg.play.conditions import Condition
@@ -87,15 +88,16 @@ def play(
     Raises:
         CliError: a scripted team over ROS, or several graphs.
     """
+    tell_note(target.note)
     if via is Via.core:
-        return evaluate_on(processes, target.team, target.scenario, conditions, episodes, seed)
+        return evaluate_on(processes, target.team, target.source, conditions, episodes, seed)
     if processes > 1:
         raise CliError(f"--processes {processes}: with --via ros one graph plays all episodes")
     if isinstance(target.team, Scripted):
         raise CliError(f"--via ros: {target.name} has no nodes; scripted teams play in the core")
     from crash_coach_bringup.ros.evaluation import evaluate_via_ros
 
-    checkpoint, scenario = Path(target.name), target.scenario
+    checkpoint, scenario = Path(target.name), target.file
     return [
         evaluate_via_ros(checkpoint, scenario, condition, episodes, seed, layout.value)
         for condition in conditions
@@ -107,9 +109,15 @@ def cost(free: Evaluation, crashed: Evaluation) -> Estimate:
     return difference(free.success, crashed.success)
 
 
+def _crash_free(results: list[tuple[Condition, Evaluation]]) -> Evaluation | None:
+    """What a crash costs is counted from; None where nobody knows what a success is."""
+    free = (result for condition, result in results if condition.crashed == 0)
+    return next((result for result in free if result.reports_success), None)
+
+
 def show(title: str, results: list[tuple[Condition, Evaluation]]) -> None:
     """Victims come last, those first that cost most."""
-    free = next((result for condition, result in results if condition.crashed == 0), None)
+    free = _crash_free(results)
     others = [each for each in results if not each[0].victim]
     victims = sorted((r for r in results if r[0].victim), key=lambda r: r[1].success_rate)
     columns = ["condition", "success (95 % interval)", "cost", "return", "steps", "crashed"]
@@ -119,7 +127,9 @@ def show(title: str, results: list[tuple[Condition, Evaluation]]) -> None:
         spread = "" if result.alike else f" ± {figures['return_std']:.2f}"
         rows.add_row(
             condition.name,
-            percent_ci(figures["success_rate"], figures["success_ci95"]),
+            percent_ci(figures["success_rate"], figures["success_ci95"])
+            if result.reports_success
+            else "not told",
             "–" if free in (None, result) else points(cost(free, result)),
             f"{figures['return_mean']:.2f}{spread}",
             f"{figures['steps_mean']:.1f}",
@@ -150,7 +160,7 @@ def _cost_json(
     results: list[tuple[Condition, Evaluation]], condition: Condition, result: Evaluation
 ) -> dict[str, Any]:
     """``cost`` and its interval, of a condition with crashes beside a crash-free one."""
-    free = next((each for other, each in results if other.crashed == 0), None)
+    free = _crash_free(results)
     if free is None or condition.crashed == 0:
         return {}
     found = cost(free, result)

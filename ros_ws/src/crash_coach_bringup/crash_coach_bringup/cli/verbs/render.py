@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -21,15 +21,20 @@ from crash_coach_bringup.cli.output import (
     check_json_target,
     console,
     not_written,
+    tell_note,
     written_first,
 )
 from crash_coach_common.strict_yaml import ConfigError
 from policy_pkg.bags.bag import is_recording
 from policy_pkg.bags.playback import play_back, read_episode
 from policy_pkg.play.conditions import Condition
-from policy_pkg.play.evaluate import evaluation_seed, record
-from policy_pkg.play.target import HELP, load_target
+from policy_pkg.play.evaluate import evaluation_seed, record, record_pictures
+from policy_pkg.play.target import HELP, Target, load_target
 from sim_pkg.render.frames import Frames
+from sim_pkg.scenario_source import ScenarioSource, read_scenario
+
+if TYPE_CHECKING:
+    from sim_pkg.foreign.pictures import Pictures
 
 FILMS, STILLS = (".mp4", ".gif"), (".png",)
 OF_A_TEAM = ("seed", "crash_rate", "crashed", "victims", "mode", "param")
@@ -46,27 +51,30 @@ def check_out(out: Path) -> None:
     check_file_target("--out", out)
 
 
-def draw(frames: Frames, out: Path, speed: float) -> None:
+def draw(frames: Frames | Pictures, out: Path, speed: float) -> None:
     """Writes the episode to ``out``.
 
     Raises:
         CliError: the file cannot be written.
     """
     # Imported here: no other verb should wait for matplotlib.
+    from sim_pkg.foreign.pictures import Pictures, write_still
     from sim_pkg.render.film import write_video
     from sim_pkg.render.still import draw_still
 
     try:
-        if out.suffix in STILLS:
-            draw_still(frames, out)
-        else:
+        if out.suffix not in STILLS:
             write_video(frames, out, speed)
+        elif isinstance(frames, Pictures):
+            write_still(frames, out)
+        else:
+            draw_still(frames, out)
     except OSError as error:
         raise CliError(not_written("--out", out, error)) from None
     console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
 
 
-def outcome(frames: Frames) -> dict[str, Any]:
+def outcome(frames: Frames | Pictures) -> dict[str, Any]:
     """JSON values: which episode it is, and how it ended."""
     return {
         "scenario": frames.scenario,
@@ -80,9 +88,11 @@ def outcome(frames: Frames) -> dict[str, Any]:
     }
 
 
-def tell(frames: Frames) -> None:
-    who = ", ".join(frames.actors[i].name for i in frames.faulted) or "nobody"
+def tell(frames: Frames | Pictures) -> None:
+    who = ", ".join(frames.robots[i] for i in frames.faulted) or "nobody"
     done = "success" if frames.success else "no success"
+    if frames.success is None:
+        done = "ended"
     told = f"episode {frames.episode}: {done} after {frames.steps} steps; crashed: {who}"
     console.print(told, highlight=False)
 
@@ -149,18 +159,29 @@ def render(
         raise CliError(f"--speed {speed}: 0.01 to 1000 times real time")
     if is_recording(Path(team)):
         refuse_options_of_a_team(context)
+        frames: Frames | Pictures
         frames, which = recorded(team, episode, scenario)
     else:
         parameters = mode_parameters(mode, param or [])
         target = load_target(team, scenario)
         condition = one_condition(target.robots, crash_rate, crashed, victims, mode, parameters)
-        one = range(episode or 0, (episode or 0) + 1)
-        (frames,) = record(target.team, target.scenario, condition, one, evaluation_seed(seed))
+        frames = play_one(target, condition, episode or 0, evaluation_seed(seed))
         crash = condition.crash.model_dump(mode="json")
         which = {"team": team, "condition": condition.name, "crash": crash, "seed": seed}
     with written_first(json, {**outcome(frames), **which, "file": str(out)}):
         tell(frames)
         draw(frames, out, speed)
+
+
+def play_one(target: Target, condition: Condition, episode: int, seed: int) -> Frames | Pictures:
+    """An episode that evaluate plays too, as what can be drawn of it."""
+    tell_note(target.note)
+    source = target.source
+    source = source if isinstance(source, ScenarioSource) else read_scenario(source)
+    if source.foreign() is not None:
+        return record_pictures(target.team, source, condition, episode, seed)
+    (frames,) = record(target.team, source, condition, range(episode, episode + 1), seed)
+    return frames
 
 
 def refuse_options_of_a_team(context: typer.Context) -> None:

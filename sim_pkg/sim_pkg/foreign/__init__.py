@@ -1,0 +1,1 @@
+"""Environments that others wrote: a PettingZoo ParallelEnv as a scenario."""
