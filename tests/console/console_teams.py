@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from crash_coach_interfaces.msg import EpisodeState
+from hypothesis import strategies as st
+from rcl_interfaces.srv import GetParameters
 from std_srvs.srv import Trigger
+from websockets.sync.client import ClientConnection, connect
 
 from crash_coach_bringup.ros.client import GraphClient, graph_client
 from crash_coach_bringup.ros.domain import reserve_domain
@@ -25,6 +30,10 @@ from crash_coach_bringup.ros.graph import (
     graph_processes,
 )
 from crash_coach_bringup.ros.supervisor import Supervisor
+from crash_coach_console.operating import WATCHED
+from crash_coach_console.ros.graph_source import read_values
+from crash_coach_pkg.coach.parameters import Value
+from crash_coach_pkg.faults import mode_names
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 
@@ -36,8 +45,8 @@ SCENARIO = "buttons"
 
 
 @contextmanager
-def console(environment: dict[str, str], *options: str) -> Iterator[str]:
-    """A console of its own process; yields the page's address."""
+def console(environment: dict[str, str], *options: str, killed: bool = False) -> Iterator[str]:
+    """A console of its own process, which is told to end, or killed; yields the page's address."""
     command = [sys.executable, "-m", "crash_coach_bringup.cli.main", "console", "--port", "0"]
     child = subprocess.Popen(
         [*command, *options],
@@ -46,14 +55,15 @@ def console(environment: dict[str, str], *options: str) -> Iterator[str]:
         text=True,
         start_new_session=True,
     )
+    assert child.stdout is not None
     try:
-        assert child.stdout is not None
         line = child.stdout.readline()
         assert line.startswith("console: http://"), line
         yield line.removeprefix("console: ").strip()
     finally:
-        child.send_signal(signal.SIGINT)
-        assert child.wait(timeout=WAIT_S) == 0
+        child.send_signal(signal.SIGKILL if killed else signal.SIGINT)
+        assert child.wait(timeout=WAIT_S) == (-signal.SIGKILL if killed else 0)
+        child.stdout.close()
 
 
 @dataclass(frozen=True)
@@ -71,6 +81,20 @@ class Teams:
         key = (episode, step)
         self.clients[0].until(lambda: key in self.crashed, WAIT_S, f"episode, step {key}")
         return self.crashed[key]
+
+    def newest(self) -> list[int]:
+        """Who of the first team was crashed in the last control step."""
+        return next(reversed(self.crashed.values()))
+
+    def parameters(self) -> dict[str, Value]:
+        """Of the first team's coach, as it has them."""
+        client = self.clients[0]
+        service = client.node.create_client(GetParameters, "/coach/get_parameters")
+        client.greet("/coach", WAIT_S, "a coach")
+        request = GetParameters.Request(names=list(WATCHED))
+        values = read_values(client.result(service.call_async(request), WAIT_S, "its answer"))
+        client.node.destroy_client(service)
+        return values
 
     def clear(self) -> None:
         """Ends every fault of both."""
@@ -118,6 +142,100 @@ def teams(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Teams]:
         asked = ("--domain", str(first), str(second))
         both = stack.enter_context(console(environment, *asked))
         yield Teams((first, second), (clients[0], clients[1]), crashed, one, both)
+
+
+class Asker:
+    """A page without a browser: sends what it likes and waits for the answer."""
+
+    def __init__(self, connection: ClientConnection) -> None:
+        self._connection = connection
+        self._id = 0
+
+    def text(self, text: str) -> dict[str, Any]:
+        self._connection.send(text)
+        return self._told("answer")
+
+    def __call__(self, **fields: Any) -> dict[str, Any]:
+        self._id += 1
+        return self.text(json.dumps({"id": self._id, "source": 0, **fields}))
+
+    def status(self) -> dict[str, Any]:
+        """Once the coach is known."""
+        while not (status := self._told("status"))["ready"]:
+            pass
+        return status
+
+    def _told(self, topic: str) -> dict[str, Any]:
+        while True:
+            message: dict[str, Any] = json.loads(self._connection.recv(timeout=WAIT_S))
+            if message["type"] == topic:
+                return message
+
+
+@contextmanager
+def asking(address: str) -> Iterator[Asker]:
+    url = address.replace("http:", "ws:") + "live"
+    with connect(url, open_timeout=WAIT_S, ping_interval=None) as connection:
+        yield Asker(connection)
+
+
+@contextmanager
+def deaf_page(address: str) -> Iterator[None]:
+    """A page that never reads what it is told."""
+    host, _, port = address.removeprefix("http://").rstrip("/").partition(":")
+    with socket.create_connection((host, int(port)), timeout=WAIT_S) as deaf:
+        deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        deaf.sendall(
+            f"GET /live HTTP/1.1\r\nHost: {host}:{port}\r\nUpgrade: websocket\r\n"
+            "Connection: Upgrade\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+            "Sec-WebSocket-Version: 13\r\n\r\n".encode()
+        )
+        yield
+
+
+def messages() -> st.SearchStrategy[str]:
+    """Any text, any JSON, and what is almost a request, or is one."""
+    names = st.sampled_from(["robot_1", "robot_2", "robot_3", "", "/coach"]) | st.text(max_size=5)
+    numbers = st.integers(-2, 40) | st.floats() | st.integers()
+    anything = st.recursive(
+        st.none() | st.booleans() | numbers | st.text(max_size=8),
+        lambda inner: (
+            st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3)
+        ),
+        max_leaves=5,
+    )
+    modes = st.sampled_from([*mode_names(), "stay", "explode"])
+    of_mode = ["steps", "p_good_to_bad", "vx", "linear_x", "sigma", "factor", "probability"]
+    fields = {
+        "id": st.integers(0, 9) | anything,
+        "source": st.sampled_from([0, 0, 0, 1]) | anything,
+        "victims": st.lists(names, max_size=3) | anything,
+        "robots": st.lists(names, max_size=3) | anything,
+        "mode": modes | anything,
+        "parameters": st.dictionaries(st.sampled_from(of_mode), numbers, max_size=2) | anything,
+        "apply_at": st.sampled_from(["next_step", "next_episode", "now"]),
+        "start_step": numbers,
+        "duration_steps": numbers,
+        "on": st.booleans() | anything,
+        "by": st.sampled_from([1, -1, 2]),
+        "frame": numbers,
+        "speed": numbers,
+        "episode": numbers,
+    }
+    kinds = [
+        "inject", "inject", "inject", "clear", "pause", "step", "reset", "forget", "seek", "pace",
+        "choose", "hello",
+    ]  # fmt: skip
+    needed = {"inject": ["victims", "mode"], "pause": ["on"], "clear": ["robots"]}
+
+    def like(kind: str) -> st.SearchStrategy[dict[str, Any]]:
+        some = {name: fields[name] for name in ["id", "source", *needed.get(kind, [])]}
+        more = {"inject": ["duration_steps", "apply_at"], "hello": list(fields)}.get(kind, [])
+        optional = {name: fields[name] for name in more if name not in some}
+        return st.fixed_dictionaries({"type": st.just(kind), **some}, optional=optional)
+
+    requests = st.sampled_from(kinds).flatmap(like)
+    return st.text(max_size=40) | anything.map(json.dumps) | requests.map(json.dumps)
 
 
 def chromium() -> str | None:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import pytest
-from console_teams import WAIT_S, Teams
+from console_teams import WAIT_S, Teams, asking, console, deaf_page, messages
+from hypothesis import given, seed, settings
+
+from crash_coach_bringup.ros.graph import graph_environment
+from crash_coach_pkg.coach.config import TeamSpec
+from crash_coach_pkg.coach.parameters import build_settings
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -166,3 +172,46 @@ def test_every_control_has_a_name_for_readers_of_the_screen(page: Page) -> None:
             .map((element) => element.outerHTML)"""
     )
     assert unnamed == []
+
+
+def test_a_browser_that_does_not_read_stops_neither_graph_nor_pages(
+    page: Page, teams: Teams
+) -> None:
+    with deaf_page(teams.one):
+        before, steps = page.evaluate(PLACES), len(teams.crashed)
+        teams.clients[0].until(lambda: len(teams.crashed) > steps + 5, WAIT_S, "control steps")
+        page.wait_for_function(MOVED, arg=before)
+
+
+def test_a_killed_console_leaves_no_fault_where_it_said_so(teams: Teams) -> None:
+    environment = {**os.environ, **graph_environment(teams.domains[0])}
+    with console(environment, "--end-faults", killed=True) as address, asking(address) as ask:
+        assert ask.status()["ends_faults"]
+        answer = ask(type="inject", victims=["robot_1"], mode="mute")
+        assert teams.crashed_at(*armed(answer["text"])) == [1, 0]
+    teams.clients[0].until(lambda: teams.newest() == [0, 0], WAIT_S, "nobody crashed")
+
+
+@pytest.mark.parametrize(
+    "count", [40, pytest.param(1000, marks=[pytest.mark.soak, pytest.mark.timeout(900)])]
+)
+def test_random_messages_get_an_error_each_and_leave_a_valid_coach(
+    teams: Teams, count: int
+) -> None:
+    """Some of them are valid, and do what they say."""
+    with asking(teams.one) as ask:
+
+        @seed(11)
+        @settings(max_examples=count, deadline=None, database=None)
+        @given(messages())
+        def send(text: str) -> None:
+            answer = ask.text(text)
+            assert isinstance(answer["ok"], bool)
+            assert answer["ok"] or answer["text"]
+
+        send()
+        assert ask(type="pause", on=False)["ok"]
+        assert ask(type="clear", robots=[])["ok"]
+    values = teams.parameters()
+    build_settings(values, TeamSpec(("robot_1", "robot_2"), (), 1.0))
+    assert values["robots"] == ("robot_1", "robot_2")

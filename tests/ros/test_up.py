@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -19,9 +20,13 @@ from crash_coach_interfaces.msg import EpisodeState
 
 from crash_coach_bringup.ros.client import graph_client
 from crash_coach_bringup.ros.graph import GraphError, UpOptions
+from crash_coach_bringup.ros.supervisor import Event
 from crash_coach_bringup.ros.up import run_up
 from crash_coach_common.strict_yaml import ConfigError
-from policy_pkg.checkpoint import CheckpointError
+from crash_coach_pkg.coach.config import CoachConfig
+from policy_pkg.checkpoint import CheckpointError, load_policy
+from policy_pkg.play.conditions import crash_free
+from policy_pkg.play.evaluate import evaluate
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 from sim_pkg.ros.sim_lock import only_sim
@@ -53,11 +58,18 @@ class Up:
     def __init__(self, child: subprocess.Popen[str]) -> None:
         self.child = child
         self.pids: dict[str, int] = {}
+        self.episodes: list[str] = []
+        self.summary: list[str] = []
 
     def event(self) -> tuple[str, str, str]:
+        """The next one; what it tells of episodes is kept aside."""
         assert self.child.stdout is not None
-        kind, process, text = json.loads(self.child.stdout.readline())
-        return kind, process, text
+        while True:
+            kind, process, text = json.loads(self.child.stdout.readline())
+            kept = {"episode": self.episodes, "summary": self.summary}.get(kind)
+            if kept is None:
+                return kind, process, text
+            kept.append(text)
 
     def started(self, count: int) -> None:
         for _ in range(count):
@@ -138,13 +150,44 @@ def test_the_last_episode_is_a_good_end(
     processes: int,
 ) -> None:
     sim = {"real_time_factor": 20.0} if mode == "realtime" else {}
-    options = {"layout": layout, "mode": mode, "episodes": 1, "sim": sim}
+    options = {"layout": layout, "mode": mode, "episodes": 2, "sim": sim}
     with up(checkpoint, tmp_path, ros_env, **options) as running:
         running.started(processes)
         assert running.event()[0] == "finished"
         assert running.event()[0] == "stopped"
         assert running.child.wait(20) == 0
         assert running.left() == []
+    wanted = evaluate(load_policy(checkpoint), "buttons", crash_free(), 2, 0).episodes
+    told = f"return {wanted[0].episode_return:.2f}, {wanted[0].steps} steps; crashed: nobody"
+    if mode == "lockstep":  # in real time a command may come too late
+        assert running.episodes == [f"episode {k}: no success, {told}" for k in (0, 1)]
+    assert [text.split(": ")[0] for text in running.episodes] == ["episode 0", "episode 1"]
+    (line,) = running.summary
+    assert line.startswith("nobody crashed: 2 episodes, success 0.0 % (")
+
+
+def test_who_was_crashed_in_each_episode_is_told_and_the_page_served(
+    checkpoint: Path, tmp_path: Path, ros_env: dict[str, str]
+) -> None:
+    options = UpOptions(
+        "buttons",
+        checkpoint,
+        layout="single",
+        episodes=3,
+        log_dir=tmp_path,
+        coach=CoachConfig(strategy="fixed", victims=("robot_2",), crash_mode="random"),
+    )
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    events: list[Event] = []
+    assert run_up(options, events.append, console=port) == 0
+    told = [event.text for event in events if event.kind == "episode"]
+    assert [text.partition(": ")[0] for text in told] == ["episode 0", "episode 1", "episode 2"]
+    assert all(text.endswith("; crashed: robot_2 (random)") for text in told), told
+    (line,) = (event.text for event in events if event.kind == "summary")
+    assert line.startswith("robot_2 (random) crashed: 3 episodes")
+    assert f"http://127.0.0.1:{port}/" in [e.text for e in events if e.process == "console"]
 
 
 def test_a_domain_with_a_sim_is_refused(

@@ -100,3 +100,7 @@ def main() -> None:
     except UserError as error:
         print(f"console: error: {error}", file=sys.stderr)  # noqa: T201
         sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

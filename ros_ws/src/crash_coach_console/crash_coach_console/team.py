@@ -62,9 +62,9 @@ class LiveTeam:
         return tuple(self._robots)
 
     @property
-    def planned(self) -> Plan | None:
-        """The coach's newest plan."""
-        return self._plan
+    def crashed(self) -> tuple[str, ...]:
+        """Robots that a fault is in force on."""
+        return tuple(name for name, robot in self._robots.items() if robot.mode)
 
     def name(self, robots: Sequence[str]) -> None:
         """Who is in the team, in order."""

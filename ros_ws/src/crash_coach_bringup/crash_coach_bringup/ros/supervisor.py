@@ -8,7 +8,7 @@ import selectors
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -44,7 +44,7 @@ class Ended:
 class Event:
     """What happened, for whoever shows it to the user."""
 
-    kind: Literal["started", "died", "finished", "interrupted", "stopped"]
+    kind: Literal["started", "episode", "died", "finished", "interrupted", "summary", "stopped"]
     process: str
     text: str
 
@@ -161,14 +161,22 @@ def watch(
     interrupted: Callable[[], bool],
     on_event: Callable[[Event], None],
     poll_s: float = 0.1,
+    meanwhile: Callable[[], None] = lambda: None,
+    companions: Collection[str] = (),
 ) -> int:
     """Waits for the end of the graph; the exit code for the command line.
+
+    ``meanwhile`` is called every ``poll_s``. That one of the ``companions`` dies is told, no more.
 
     The normal end is that a process named in ``last`` (the sim, after its episodes) exits 0: 0.
     An interruption by the user is 130, as in a shell. Any other end is a death: 1.
     """
     while not interrupted():
+        meanwhile()
         ended = supervisor.wait(poll_s)
+        for e in [e for e in ended if e.name in companions]:
+            on_event(Event("died", e.name, e.describe()))
+            ended.remove(e)
         for e in ended:
             if e.name in last and e.exit_code == 0:
                 on_event(Event("finished", e.name, "all episodes are done"))

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+from crash_coach_bringup.ros.episodes import listening, summary_lines
 from crash_coach_bringup.ros.graph import (
     GraphError,
+    Process,
     UpOptions,
     check_team,
     domain_id,
@@ -16,11 +19,20 @@ from crash_coach_bringup.ros.graph import (
     graph_processes,
 )
 from crash_coach_bringup.ros.supervisor import Event, Supervisor, watch
+from crash_coach_console.access import Access
+from crash_coach_console.episodes import Played
+from crash_coach_console.serve import check_address, page_url
 from sim_pkg.ros.sim_lock import SecondSimError, only_sim
 
+CONSOLE = "console"
 
-def run_up(options: UpOptions, on_event: Callable[[Event], None]) -> int:
+
+def run_up(
+    options: UpOptions, on_event: Callable[[Event], None], console: int | None = None
+) -> int:
     """Runs the graph; returns the exit code: 0 after the last episode, 1 after a death, 130.
+
+    ``console``: port on which its page is served meanwhile; the graph goes on without it.
 
     ``on_event`` hears what happens as it happens. Call it from the main thread: SIGINT,
     SIGTERM and SIGHUP stop the graph in order while it runs.
@@ -33,17 +45,44 @@ def run_up(options: UpOptions, on_event: Callable[[Event], None]) -> int:
     """
     domain = domain_id(options)
     processes = graph_processes(options, check_team(options))
+    if console is not None:
+        processes.append(console_process(console))
     refuse_second_sim(domain)
     environment, lockstep = graph_environment(domain), options.mode == "lockstep"
     with (
         stop_signals() as interrupted,
+        listening(domain) as episodes,
         Supervisor(processes, options.log_dir, environment, throughput=lockstep) as running,
     ):
+
+        def tell(found: Iterable[Played]) -> None:
+            for played in found:
+                on_event(Event("episode", "", str(played)))
+
         for name, pid in running.pids().items():
             on_event(Event("started", name, f"process {pid}, log {running.log_of(name)}"))
-        exit_code = watch(running, ("sim", "graph"), interrupted, on_event)
+        if console is not None:
+            on_event(Event("started", CONSOLE, page_url(Access(), console)))
+        exit_code = watch(
+            running,
+            ("sim", "graph"),
+            interrupted,
+            on_event,
+            meanwhile=lambda: tell(episodes.told()),
+            companions=(CONSOLE,),
+        )
+        tell(episodes.rest())
+    for line in summary_lines(episodes.costs):
+        on_event(Event("summary", "", line))
     on_event(Event("stopped", "", f"no process is left on domain {domain}"))
     return exit_code
+
+
+def console_process(port: int) -> Process:
+    """Raises UserError where the port is taken."""
+    check_address(Access().host, port)
+    arguments = ("-m", "crash_coach_console.command", "--port", str(port))
+    return Process(CONSOLE, (sys.executable, *arguments))
 
 
 def refuse_second_sim(domain: int) -> None:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
+import struct
 from typing import Any
 
+from builtin_interfaces.msg import Time
 from crash_coach_interfaces.msg import Arena as ArenaMessage
 from crash_coach_interfaces.msg import ArenaState, CrashPlan, FaultEvent
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import Quaternion
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue
 from rclpy.parameter import Parameter, parameter_value_to_python
@@ -32,6 +36,9 @@ _SIDES = {
     ArenaMessage.THINGS: "things",
 }
 _NS = 1e-9
+_LITTLE_ENDIAN = b"\x00\x01"
+_LENGTH = struct.Struct("<I")
+_FRAME_ID_AT = 16
 
 
 def arena_from_message(message: ArenaMessage) -> Arena:
@@ -69,11 +76,10 @@ def arena_from_message(message: ArenaMessage) -> Arena:
 
 
 def state_from_message(message: ArenaState) -> State:
-    stamp = message.header.stamp
     return State(
         episode=message.episode,
         step=message.step,
-        time_s=stamp.sec + stamp.nanosec * _NS,
+        time_s=seconds(message.header.stamp),
         episode_return=message.episode_return,
         ended=message.ended,
         success=message.success,
@@ -84,6 +90,16 @@ def state_from_message(message: ArenaState) -> State:
         crashed=tuple(message.crashed),
         hits=tuple(message.hits),
     )
+
+
+def seconds(stamp: Time) -> float:
+    return float(stamp.sec + stamp.nanosec * _NS)
+
+
+def yaw_rad(orientation: Quaternion) -> float:
+    """The turn about the vertical."""
+    x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
+    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def plan_from_message(message: CrashPlan) -> Plan:
@@ -105,6 +121,19 @@ def plan_from_message(message: CrashPlan) -> Plan:
             for fault in message.faults
         ),
     )
+
+
+def event_kind(data: bytes) -> int:
+    """Of a serialized FaultEvent, without reading the rest: there may be hundreds a second.
+
+    The layout is plain little-endian CDR: encapsulation (4 bytes), stamp (8), frame_id with its
+    length, kind. Anything else, or cut short: -1.
+    """
+    if data[:2] != _LITTLE_ENDIAN or len(data) < _FRAME_ID_AT:
+        return -1
+    (length,) = _LENGTH.unpack_from(data, _FRAME_ID_AT - _LENGTH.size)
+    at = _FRAME_ID_AT + length
+    return data[at] if at < len(data) else -1
 
 
 def event_value(message: FaultEvent) -> dict[str, Any]:

@@ -8,18 +8,21 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from functools import partial
 from typing import Any, Protocol
 
 from crash_coach_interfaces.msg import Arena, ArenaState, CrashPlan, EpisodeState, FaultEvent
 from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 from std_srvs.srv import SetBool, Trigger
 
 SPIN_S = 0.02
@@ -49,6 +52,7 @@ class Listener(Protocol):
     def on_plan(self, message: CrashPlan) -> None: ...
     def on_plan_in_force(self, message: CrashPlan) -> None: ...
     def on_diagnostics(self, message: DiagnosticArray) -> None: ...
+    def on_odometry(self, robot: str, message: Odometry) -> None: ...
     def on_problem(self, text: str) -> None:
         """What ended the link: nothing more is heard."""
         ...
@@ -58,16 +62,34 @@ class Listener(Protocol):
         ...
 
 
-class GraphLink:
-    """``domain`` None: the environment's. ``namespace``: of the graph, '' for none."""
+class Silent:
+    """Hears nothing: for who only asks."""
 
-    def __init__(self, listener: Listener, domain: int | None, namespace: str) -> None:
-        self._listener = listener
+    def on_problem(self, text: str) -> None:
+        pass
+
+    def on_tick(self, now_s: float) -> None:
+        pass
+
+
+class GraphLink:
+    """``domain`` None: the environment's. ``namespace``: of the graph, '' for none.
+
+    ``listen`` false: it asks only.
+    """
+
+    def __init__(
+        self, listener: Listener | Silent, domain: int | None, namespace: str, listen: bool = True
+    ) -> None:
+        self._listener: Any = listener
+        self._listen = listen
         self._domain = domain
         self._namespace = namespace
         self._tasks: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._stop = threading.Event()
         self._clients: dict[str, Client] = {}
+        self._node: Node | None = None
+        self._odometry: list[Subscription] = []
         self._open: dict[Any, tuple[Future[Any], float]] = {}
         self._started: Future[None] = Future()
         self._thread = threading.Thread(target=self._run, name="graph link", daemon=True)
@@ -80,6 +102,18 @@ class GraphLink:
     def stop(self) -> None:
         self._stop.set()
         self._thread.join()
+
+    def follow(self, robots: Sequence[str]) -> None:
+        """On the link's thread: hears the odometry of these robots, and of nobody else."""
+        assert self._node is not None  # made before the thread serves
+        for reader in self._odometry:
+            self._node.destroy_subscription(reader)
+        self._odometry = [
+            self._node.create_subscription(
+                Odometry, f"{robot}/odom", partial(self._listener.on_odometry, robot), NEWEST
+            )
+            for robot in robots
+        ]
 
     def run(self, task: Callable[[], None]) -> None:
         """Runs ``task`` on the link's thread, soon."""
@@ -105,7 +139,7 @@ class GraphLink:
         return answer
 
     def ready(self, service: str) -> bool:
-        """On the link's thread: whether somebody serves it."""
+        """Whether somebody serves it."""
         return bool(self._clients[service].service_is_ready())
 
     def _run(self) -> None:
@@ -113,7 +147,7 @@ class GraphLink:
         executor = node = None
         try:
             context.init(args=[], domain_id=self._domain)
-            node = self._make_node(context)
+            node = self._node = self._make_node(context)
             executor = EventsExecutor(context=context)
             executor.add_node(node)
         except Exception as error:  # noqa: BLE001  # told to whoever called start
@@ -159,6 +193,13 @@ class GraphLink:
             use_global_arguments=False,
             enable_rosout=False,
         )
+        if self._listen:
+            self._subscribe(node)
+        for name, (type_, service) in SERVICES.items():
+            self._clients[name] = node.create_client(type_, service)
+        return node
+
+    def _subscribe(self, node: Node) -> None:
         hear, many = self._listener, QoSProfile(depth=1000)
         sub = node.create_subscription
         sub(Arena, "sim/arena", hear.on_arena, LATCHED)
@@ -169,6 +210,3 @@ class GraphLink:
         sub(CrashPlan, "coach/plan", hear.on_plan, LATCHED)
         sub(CrashPlan, "coach/plan_in_force", hear.on_plan_in_force, LATCHED)
         sub(DiagnosticArray, "/diagnostics", hear.on_diagnostics, QoSProfile(depth=10))
-        for name, (type_, service) in SERVICES.items():
-            self._clients[name] = node.create_client(type_, service)
-        return node

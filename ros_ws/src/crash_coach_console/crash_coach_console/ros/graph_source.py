@@ -11,12 +11,14 @@ from typing import Any
 
 from crash_coach_interfaces.msg import Arena, ArenaState, CrashPlan, EpisodeState, FaultEvent
 from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from std_srvs.srv import SetBool, Trigger
 
 from crash_coach_common.contract import UserError
 from crash_coach_console.board import Board
 from crash_coach_console.episodes import Costs, EpisodeBook
+from crash_coach_console.fleet import Fleet
 from crash_coach_console.operating import (
     WATCHED,
     OperatorError,
@@ -35,6 +37,7 @@ from crash_coach_console.requests import (
 )
 from crash_coach_console.ros import convert
 from crash_coach_console.ros.graph_link import GraphLink
+from crash_coach_console.ros.guardian import Guardian
 from crash_coach_console.source import Kind
 from crash_coach_console.team import LiveTeam
 from crash_coach_pkg.coach.injection import describe, injection
@@ -43,6 +46,7 @@ from crash_coach_pkg.coach.parameters import Value
 POLL_S = 1.0
 SHOW_S = 0.2
 """How often a team's state is posted at most."""
+DRAW_S = 1 / 30
 SILENT_S = 3.5
 ARMED_S = 1.0
 
@@ -50,7 +54,7 @@ ARMED_S = 1.0
 class GraphSource:
     """The graph on ``domain`` (None: the environment's) under ``namespace``.
 
-    ``ends_faults``: ``close`` clears every fault.
+    ``ends_faults``: every fault is cleared after ``close``, or when this process is killed.
     """
 
     kind: Kind = "graph"
@@ -68,13 +72,16 @@ class GraphSource:
         self.namespace = namespace
         self.ends_faults = ends_faults
         self._title = title
+        self._guardian: Guardian | None = None
         self._link = GraphLink(self, domain, namespace)
         self._team = LiveTeam()
         self._book = EpisodeBook()
         self._costs = Costs()
         self._values: dict[str, Value] = {}
         self._heard_s = {"sim": -1e9, "coach": -1e9, "gate": -1e9}
-        self._asked_s = self._shown_s = -1e9
+        self._asked_s = self._shown_s = self._drawn_s = -1e9
+        self._arena = False  # whether our sim has told its own
+        self._fleet = Fleet(())
         self._status: Mapping[str, Any] = {}
         self._armed: tuple[int, int] | None = None
         self._paused = False
@@ -87,18 +94,14 @@ class GraphSource:
 
     def start(self) -> None:
         self._link.start()
+        if self.ends_faults:
+            self._guardian = Guardian(self.domain, self.namespace)
 
     def close(self) -> None:
         """Raises UserError where faults should have ended and no coach said that they did."""
-        try:
-            if self.ends_faults and self._heard_s["coach"] > 0:
-                answer = self._link.call("clear_all", Trigger.Request()).result()
-                if not answer.success:
-                    raise UserError(f"faults may still be in force: {answer.message}")
-        except TimeoutError as error:
-            raise UserError(f"faults may still be in force: {error}") from None
-        finally:
-            self._link.stop()
+        self._link.stop()
+        if self._guardian is not None:
+            self._guardian.close()
 
     # --- what the graph says (on the link's thread) ---------------------------------------------
 
@@ -108,6 +111,8 @@ class GraphSource:
         except UserError as error:
             self.on_problem(str(error))
             return
+        self._arena, self._fleet = True, Fleet(())
+        self._link.follow(())
         self._team.name(arena.robots)
         self.board.post("arena", arena.value())
 
@@ -150,11 +155,30 @@ class GraphSource:
         self._team.in_force(convert.plan_from_message(message))
 
     def on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            found = convert.diagnosis(status)
+        lines = [convert.diagnosis(status) for status in message.status]
+        self._list([line[1] for line in lines if line is not None and line[0] == "gate"])
+        for found in lines:
             if found is not None:
                 self._heard_s[found[0]] = time.monotonic()
                 self._team.diagnosed(*found)
+
+    def on_odometry(self, robot: str, message: Odometry) -> None:
+        pose, stamp = message.pose.pose, message.header.stamp
+        place = (pose.position.x, pose.position.y, convert.yaw_rad(pose.orientation))
+        self._fleet.told(robot, place, convert.seconds(stamp))
+
+    def _list(self, robots: Sequence[str]) -> None:
+        """A team without our sim, as its gate or its coach names it."""
+        if not self._arena and robots and tuple(robots) != self._fleet.robots:
+            self._team.name(robots)
+            self._fleet = Fleet(robots)
+            self._link.follow(robots)
+
+    def _show_fleet(self) -> None:
+        if self._fleet.grown and self._fleet.moved:
+            self.board.post("arena", self._fleet.arena().value())
+        if self._fleet.moved:
+            self.board.post("state", self._fleet.state(self._team.crashed).value())
 
     def on_problem(self, text: str) -> None:
         event = {"kind": "problem", "episode": 0, "step": None, "robot": "", "mode": ""}
@@ -164,6 +188,9 @@ class GraphSource:
         for played in self._book.settled(now_s):
             self._costs.add(played)
             self._post_costs()
+        if now_s - self._drawn_s >= DRAW_S:
+            self._drawn_s = now_s
+            self._show_fleet()
         if now_s - self._shown_s >= SHOW_S:
             self._shown_s = now_s
             if self._team.changed:
@@ -185,8 +212,8 @@ class GraphSource:
     def _show(self, answer: GetParameters.Response) -> None:
         values = read_values(answer)
         robots = values.get("robots")
-        if isinstance(robots, tuple) and not self._team.robots:
-            self._team.name([str(name) for name in robots])
+        if isinstance(robots, tuple):
+            self._list([str(name) for name in robots])
         if values and values != self._values:
             self._values = values
             self.board.post("coach", {"settings": settings_value(values)})

@@ -145,6 +145,10 @@ export class Stage {
   // --- words ------------------------------------------------------------------------------------
 
   showFacts(state) {
+    if (!this.arena?.scenario) {
+      setText(this.part(".facts"), `${this.team.robots.length} robots`);
+      return;
+    }
     const end = state.ended ? (state.success ? " · success" : " · no success") : "";
     setText(this.part(".facts"), `episode ${state.episode} · step ${state.step} · `
       + `${state.time_s.toFixed(1)} s · return ${state.return.toFixed(2)}${end}`);

@@ -131,6 +131,12 @@ def summary(results: Results, found: Finding, out: Path, seed: int) -> dict[str,
     }
 
 
+def console_line(out: Path) -> str:
+    """How to look at both teams."""
+    teams = " ".join(str(out / method) for method in METHODS)
+    return f"See both, and crash robots by a click: crash-coach console {teams}"
+
+
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for runs, figures, pictures.")] = Path(
         "runs/demo"
@@ -178,5 +184,6 @@ def demo(
         console.print(f"  {what:<21}{where}", soft_wrap=True)
     console.print()
     console.print(found.text, style="green" if found.holds else "bold red", soft_wrap=True)
+    console.print(console_line(out), soft_wrap=True)
     if not found.holds:
         raise typer.Exit(1)

@@ -10,6 +10,7 @@ import typer
 
 from crash_coach_bringup.cli.output import CliError
 from crash_coach_bringup.cli.verbs.evaluate import Layout, LayoutOption
+from crash_coach_console.serve import PORT
 from policy_pkg.play.conditions import at_rate
 
 if TYPE_CHECKING:
@@ -21,8 +22,24 @@ class Mode(StrEnum):
     realtime = "realtime"
 
 
+RelayOption = Annotated[
+    bool,
+    typer.Option(
+        "--relay-observations",
+        help="Observations pass through the gate: blind, stale and noise can be injected.",
+    ),
+]
+ConsoleOption = Annotated[bool, typer.Option("--console", help="Also serve the team's web page.")]
+PortOption = Annotated[
+    int, typer.Option(help="Port of the page, with --console.", min=1, max=65535)
+]
+
+
 def show(event: Event) -> None:
     """One line per event; a death goes to stderr with the end of the node's log."""
+    if event.kind in ("episode", "summary"):
+        typer.echo(event.text)
+        return
     words = [word for word in (event.kind, event.process, event.text) if word]
     typer.echo(f"up: {': '.join(words)}", err=event.kind == "died")
 
@@ -45,16 +62,15 @@ def up(
     crash_rate: Annotated[
         float, typer.Option(help="Each robot is mute in an episode with this probability.")
     ] = 0.0,
-    relay_observations: Annotated[
-        bool,
-        typer.Option(
-            "--relay-observations",
-            help="Observations pass through the gate: blind, stale and noise can be injected.",
-        ),
-    ] = False,
+    relay_observations: RelayOption = False,
+    console: ConsoleOption = False,
+    port: PortOption = PORT,
     logs: Annotated[Path, typer.Option(help="Folder for the nodes' logs.")] = Path("runs/up"),
 ) -> None:
-    """Starts sim, policies, gate and coach until the last episode, Ctrl-C, or a node's death."""
+    """Starts sim, policies, gate and coach until the last episode, Ctrl-C, or a node's death.
+
+    Says of every episode who was crashed and how it went, and sums up at the end.
+    """
     for name, value in (("epsilon", epsilon), ("crash-rate", crash_rate)):
         if not 0 <= value <= 1:
             raise CliError(f"--{name} {value}: a probability from 0 to 1 is needed")
@@ -73,4 +89,4 @@ def up(
         relay_observations=relay_observations,
         log_dir=logs,
     )
-    raise typer.Exit(run_up(options, show))
+    raise typer.Exit(run_up(options, show, port if console else None))
