@@ -177,6 +177,19 @@ def test_evaluate_writes_what_it_prints(checkpoint: Path, tmp_path: Path) -> Non
     assert result["trajectory_hash"] in done.stdout
 
 
+def test_the_open_loop_control(tmp_path: Path) -> None:
+    out = tmp_path / "result.json"
+    done = typed("calibrate", "buttons", "--open-loop", "--episodes", "4", "--json", str(out))
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(out.read_text())["rows"]
+    assert [row["policy"] for row in rows] == ["open loop, what it can do", "open loop"]
+    # Nothing is drawn on buttons: a list of actions is all that it takes.
+    assert [row["success_rate"] for row in rows] == [1.0, 1.0]
+    assert "--open-loop searches" in refused(
+        "calibrate", "buttons", "--open-loop", "--crashed", "1"
+    )
+
+
 def test_evaluate_tells_what_each_robot_costs(tmp_path: Path) -> None:
     out = tmp_path / "result.json"
     team = ("evaluate", "scripted:coverage_adaptive", "--scenario", "coverage")

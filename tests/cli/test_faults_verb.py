@@ -24,7 +24,7 @@ from crash_coach_pkg.coach.fault_scenario import (
     load_fault_scenario,
 )
 from policy_pkg.play.conditions import crash_free
-from policy_pkg.play.evaluate import evaluate
+from policy_pkg.play.evaluate import evaluate, evaluation_seed
 from policy_pkg.play.target import Target, load_target
 from policy_pkg.report.verdict import FaultRun, judge_run
 from policy_pkg.untrained import write_untrained
@@ -82,7 +82,7 @@ def test_every_shipped_file_plays_and_takes_effect(name: str, checkpoint: Path) 
 def test_the_pair_without_faults_is_the_plain_evaluation() -> None:
     target = load_target("scripted:coverage_fixed", "coverage")
     run = played("hazard", target, 3)
-    assert run.crash_free == evaluate(target.team, "coverage", crash_free(), 3, 0)
+    assert run.crash_free == evaluate(target.team, "coverage", crash_free(), 3, evaluation_seed(0))
     assert [pair.episode for pair in run.trials.pairs] == [0, 1, 2]
     hashes = [e.trajectory_hash for e in run.faulted.episodes]
     assert hashes != [e.trajectory_hash for e in run.crash_free.episodes]
@@ -92,7 +92,9 @@ def test_effects_are_those_of_the_plan(tmp_path: Path) -> None:
     scenario = load_fault_scenario(Path(file_of(tmp_path, "effects: {}")))
     target = load_target("scripted:hold", "buttons")
     run = play(scenario, target, 20, 3, Via.core, Layout.nodes)
-    planner = ScenarioPlanner(scenario, TeamSpec.of(make_env("buttons", 1).spec), 3)
+    planner = ScenarioPlanner(
+        scenario, TeamSpec.of(make_env("buttons", 1).spec), evaluation_seed(3)
+    )
     expected = set()
     for episode in range(20):
         (fault,) = planner.plan(episode).faults
@@ -116,6 +118,25 @@ def test_a_fault_after_the_end_of_its_episode_was_not_due(tmp_path: Path) -> Non
     assert [pair.faulted for pair in run.trials.pairs] == [
         pair.crash_free for pair in run.trials.pairs
     ]
+
+
+def test_a_fault_that_only_meets_a_dead_robot_takes_no_effect(tmp_path: Path) -> None:
+    """Standing still, robots of 3m are dead long before the end of its 60 steps."""
+    text = "description: d\nfaults: [{victims: [robot_1], start_step: START}]\n"
+    found = {}
+    for start in (0, 20):
+        file = file_of(tmp_path, "effects: {}", text.replace("START", str(start)))
+        target = load_target("scripted:nearest", "skirmish/3m")
+        run = play(load_fault_scenario(Path(file)), target, 12, 0, Via.core, Layout.nodes)
+        due = [fault for pair in run.trials.pairs for fault in pair.due]
+        found[start] = run.verdicts[0].finding, due
+    early, due = found[0]
+    assert (early.status, early.note, len(due)) == ("passed", "", 12)
+    late, due = found[20]
+    dead = sum(fault.met_dead for fault in due)
+    assert dead > 0
+    assert (late.status, late.counts) == ("failed", (len(due) - dead, len(due)))
+    assert late.note == f"{dead} only met a robot that was out of action already"
 
 
 def test_other_episodes_are_not_paired() -> None:

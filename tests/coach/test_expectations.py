@@ -84,6 +84,10 @@ def test_effects_of_every_entry() -> None:
     found = judge({"effects": {"at_least": 0.0}}, pair(due=both[:1]), entries=3)
     assert (found.status, found.note) == ("failed", "never due: entry 1, 2 of faults")
     assert judge({"effects": {"at_least": 0.0}}, pair()).status == "failed"
+    dead = DueFault(0, "robot_2", took_effect=False, met_dead=True)
+    found = judge({"effects": {}}, pair(due=(both[0], dead)))
+    assert (found.status, found.counts) == ("failed", (1, 2))
+    assert found.note == "1 only met a robot that was out of action already"
 
 
 @pytest.mark.parametrize(

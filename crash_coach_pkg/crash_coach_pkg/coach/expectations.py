@@ -27,11 +27,16 @@ class Outcome:
 
 @dataclass(frozen=True)
 class DueFault:
-    """A fault whose time came: its start step was reached, or its trigger fired."""
+    """A fault whose time came: its start step was reached, or its trigger fired.
+
+    ``met_dead``: it only ever met commands of a robot that could do nothing any more, and so took
+    no effect.
+    """
 
     entry: int
     robot: str
     took_effect: bool
+    met_dead: bool = False
 
 
 @dataclass(frozen=True)
@@ -159,7 +164,8 @@ class Recovered(ExpectationKind):
 
 
 class Effects(ExpectationKind):
-    """Of all faults whose time came: those that took effect. Every entry's time has to come."""
+    """Of all faults whose time came: those that took effect. Every entry's time has to come.
+    A fault on commands that only met a robot that was out of action already took none."""
 
     at_least: float = Field(default=1.0, ge=0, le=1, description="Share of the faults.")
 
@@ -171,7 +177,10 @@ class Effects(ExpectationKind):
     def judge(self, trials: Trials) -> Finding:
         due = [fault for pair in trials.pairs for fault in pair.due]
         never = sorted(set(range(trials.entries)) - {fault.entry for fault in due})
-        note = f"never due: entry {', '.join(map(str, never))} of faults" if never else ""
+        notes = [f"never due: entry {', '.join(map(str, never))} of faults"] if never else []
+        if dead := sum(fault.met_dead for fault in due):
+            notes.append(f"{dead} only met a robot that was out of action already")
+        note = "; ".join(notes)
         if not due:
             return Finding("failed", None, note=note)
         hits = sum(fault.took_effect for fault in due)

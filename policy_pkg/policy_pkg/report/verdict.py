@@ -59,16 +59,20 @@ def judge_run(
     planner: ScenarioPlanner,
     faulted: Evaluation,
     crash_free: Evaluation,
+    dead_actions: Sequence[int] = (),
 ) -> FaultRun:
     """Pairs the episodes and judges the scenario's expectations.
 
     Args:
         faulted: with its effects.
+        dead_actions: those of a robot that can do nothing else any more.
 
     Raises:
         ValueError: the evaluations are not the same episodes of the same seed.
     """
-    trials = Trials(len(scenario.faults), _pairs(planner, faulted, crash_free))
+    trials = Trials(
+        len(scenario.faults), _pairs(planner, faulted, crash_free, frozenset(dead_actions))
+    )
     verdicts = tuple(_verdict(expectation, trials) for expectation in scenario.expect)
     modes = [fault.crash_mode for fault in scenario.faults]
     entries = tuple(_entry(i, mode, trials, faulted.effects) for i, mode in enumerate(modes))
@@ -76,7 +80,10 @@ def judge_run(
 
 
 def _pairs(
-    planner: ScenarioPlanner, faulted: Evaluation, crash_free: Evaluation
+    planner: ScenarioPlanner,
+    faulted: Evaluation,
+    crash_free: Evaluation,
+    dead_actions: frozenset[int],
 ) -> tuple[Pair, ...]:
     keys = [[(run.seed, e.episode) for e in run.episodes] for run in (faulted, crash_free)]
     if keys[0] != keys[1]:
@@ -85,7 +92,10 @@ def _pairs(
     for row in faulted.effects:
         rows[row.episode].append(row)
     return tuple(
-        _pair(planner.plan(under.episode), faulted.robots, under, free, rows[under.episode])
+        _pair(
+            planner.plan(under.episode),
+            *(faulted.robots, under, free, rows[under.episode], dead_actions),
+        )
         for under, free in zip(faulted.episodes, crash_free.episodes, strict=True)
     )
 
@@ -96,9 +106,15 @@ def _pair(
     faulted: EpisodeResult,
     crash_free: EpisodeResult,
     rows: Sequence[EffectRow],
+    dead_actions: frozenset[int],
 ) -> Pair:
     active = {(row.entry, row.robot) for row in rows if row.kind == "ACTIVE"}
-    took_effect = {(row.entry, row.robot) for row in rows if row.kind == "EFFECT"}
+    met = {(row.entry, row.robot) for row in rows if row.kind == "EFFECT"}
+    took_effect = {
+        (row.entry, row.robot)
+        for row in rows
+        if row.kind == "EFFECT" and row.intent not in dead_actions
+    }
     due = set()
     for fault in plan.faults:
         key = (fault.entry, robots[fault.robot])
@@ -110,7 +126,9 @@ def _pair(
         crash_free=_outcome(crash_free),
         faulted=_outcome(faulted),
         crashed=len(faulted.crashed),
-        due=tuple(DueFault(*key, key in took_effect) for key in sorted(due)),
+        due=tuple(
+            DueFault(*key, key in took_effect, key in met - took_effect) for key in sorted(due)
+        ),
     )
 
 

@@ -35,7 +35,8 @@ class EnvSpec:
     reachable situation at least one of them is available to every robot. ``bounds`` are the
     lowest and highest value that any observation or state feature can take. ``roles`` has one name
     per robot: faults may be aimed at a role. ``reports_success``, ``reports_positions``: whether
-    ``StepResult.success`` and ``BatchEnv.positions_m`` mean anything.
+    ``StepResult.success`` and ``BatchEnv.positions_m`` mean anything. ``dead_actions``: those that
+    only a robot has which can do nothing else any more.
     """
 
     scenario: str
@@ -50,6 +51,7 @@ class EnvSpec:
     bounds: tuple[float, float]
     reports_success: bool = True
     reports_positions: bool = True
+    dead_actions: tuple[int, ...] = ()
 
     @property
     def n_robots(self) -> int:

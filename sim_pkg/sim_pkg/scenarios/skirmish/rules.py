@@ -68,6 +68,7 @@ class Skirmish:
             roles=tuple(placed.unit for placed in config.robots),
             action_names=layout.action_names,
             stay_actions=(STOP, NO_OP),
+            dead_actions=(NO_OP,),
             obs_size=layout.obs_size,
             state_size=layout.state_size,
             episode_limit=config.episode_limit,

@@ -59,7 +59,7 @@ def play(
         planned = Planned(faults.path.stem, lambda team, key: ScenarioPlanner(faults, team, key))
         faulted = evaluate(target.team, target.source, planned, episodes, seed, effects=True)
         free = evaluate(target.team, target.source, crash_free(), episodes, seed)
-    return judge_run(faults, planner, faulted, free)
+    return judge_run(faults, planner, faulted, free, spec.dead_actions)
 
 
 def _play_via_ros(

@@ -30,9 +30,11 @@ from policy_pkg.play.conditions import Condition
 from policy_pkg.play.evaluate import Scripted, evaluation_seed, record
 from policy_pkg.statistics import wilson
 from sim_pkg.env import make_env
+from sim_pkg.open_loop import Search, play, search
 from sim_pkg.render.frames import Frames, Side
 from sim_pkg.scripted import make_scripted, scripted_names
 
+OPEN_LOOP = {"open loop, what it can do": True, "open loop": False}  # whether it knows the mask
 AT_ONCE = 256  # episodes that are kept before they are counted; about 100 kB each
 
 
@@ -135,6 +137,39 @@ def show(title: str, rows: Sequence[dict[str, Any]]) -> None:
     console.print(out)
 
 
+def open_loop_rows(scenario: str, episodes: int, seed: int) -> list[dict[str, Any]]:
+    """A row per kind of open-loop team: the best one found, on episodes that chose none."""
+    how = Search()
+    env = make_env(scenario, how.arenas)
+    rows = []
+    for name, masked in OPEN_LOOP.items():
+        team = search(env, masked, seed, how)
+        score = play(team, env, evaluation_seed(seed), range(episodes))
+        interval = wilson(score.wins, score.episodes)
+        rows.append(
+            {
+                "scenario": scenario,
+                "policy": name,
+                "condition": "crash-free",
+                "success_rate": score.wins / score.episodes,
+                "success_ci95": [interval.low, interval.high],
+                "steps_mean": score.steps_mean,
+                "return_mean": score.return_mean,
+                "scores": team.scores.tolist(),
+            }
+        )
+    return rows
+
+
+def show_open_loop(title: str, rows: Sequence[dict[str, Any]]) -> None:
+    out = table(title, ["team", "success (95 %)", "steps", "return"])
+    for row in rows:
+        success = percent_ci(row["success_rate"], row["success_ci95"])
+        steps, returns = f"{row['steps_mean']:.0f}", f"{row['return_mean']:.1f}"
+        out.add_row(row["policy"], success, steps, returns)
+    console.print(out)
+
+
 def calibrate(
     scenarios: Annotated[
         list[str] | None, typer.Argument(metavar="SCENARIO", help="Scenario names or YAML files.")
@@ -148,6 +183,13 @@ def calibrate(
     episodes: Annotated[
         int, typer.Option(help="Episodes of each.", min=1, max=MOST_EPISODES)
     ] = 256,
+    open_loop: Annotated[
+        bool,
+        typer.Option(
+            "--open-loop",
+            help="Instead: the best teams found that see only their names and the time step.",
+        ),
+    ] = False,
     seed: Annotated[int, typer.Option(help="Seed of episodes and victims.", min=0)] = 0,
     json: Annotated[Path | None, typer.Option(help="Also write the figures to this file.")] = None,
 ) -> None:
@@ -157,14 +199,20 @@ def calibrate(
         raise CliError("no scenario: name at least one, such as skirmish/3s_vs_5z")
     # What is wrong is said before anything is played.
     parameters = mode_parameters(mode, param or [])
+    if open_loop and (policy or crashed):
+        raise CliError("--open-loop searches for teams that work: without --policy and --crashed")
     asked = {
         name: asked_of(name, policy or [], crashed or [], mode, parameters) for name in scenarios
     }
     rows: list[dict[str, Any]] = []
     for scenario, played in asked.items():
-        rows += rows_of(scenario, played, episodes, seed)
+        if open_loop:
+            rows += open_loop_rows(scenario, episodes, seed)
+        else:
+            rows += rows_of(scenario, played, episodes, seed)
     how = {"mode": mode, "parameters": parameters}
     with written_first(json, {"seed": seed, "episodes": episodes, **how, "rows": rows}):
         for scenario in asked:
             here = [row for row in rows if row["scenario"] == scenario]
-            show(f"{scenario}: {episodes} episodes each, seed {seed}", here)
+            title = f"{scenario}: {episodes} episodes each, seed {seed}"
+            (show_open_loop if open_loop else show)(title, here)
