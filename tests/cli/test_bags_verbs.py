@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "bags"))
 from bag_maker import Team, messages, played, write
 
 from crash_coach_bringup.cli.main import main

@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "bags"))
 from bag_maker import Team, messages, played, write
 from in_process import refused, typed
 

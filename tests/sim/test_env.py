@@ -52,7 +52,7 @@ def test_same_bits_for_1_8_and_64_arenas() -> None:
 
 def test_same_bits_in_another_process() -> None:
     code = (
-        "import sys; sys.path.insert(0, 'tests/sim'); import test_env; "
+        "import sys; sys.path += ['tests/support', 'tests/sim']; import test_env; "
         "from sim_pkg.trajectory import combine; print(combine(test_env.hashes(4, 16)))"
     )
     other = subprocess.run(

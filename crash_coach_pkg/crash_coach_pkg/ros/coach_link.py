@@ -13,7 +13,8 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from crash_coach_common.contract import UserError
-from crash_coach_common.ros.run_node import BLOCKS, EPISODE, EVENTS, PLAN, TICK_S
+from crash_coach_common.ros.qos import BLOCKS, EPISODE, EVENTS, PLAN
+from crash_coach_common.ros.run_node import TICK_S
 from crash_coach_pkg.coach.live_coach import Control
 from crash_coach_pkg.plan import CrashPlan
 from crash_coach_pkg.ros.convert import (

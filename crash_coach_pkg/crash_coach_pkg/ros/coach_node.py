@@ -27,8 +27,8 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from crash_coach_common.contract import UserError
-from crash_coach_common.ros.parameters import CheckedParameterService
-from crash_coach_common.ros.run_node import SPIN_S, refuse_unknown_parameters, spin
+from crash_coach_common.ros.parameters import CheckedParameterService, refuse_undeclared
+from crash_coach_common.ros.run_node import SPIN_S, spin
 from crash_coach_pkg.coach.coach import Planner
 from crash_coach_pkg.coach.config import TeamSpec
 from crash_coach_pkg.coach.fault_scenario import (
@@ -66,7 +66,7 @@ class CoachNode(Node):
         self._unconfirmed = ""  # why no gate confirmed the last change that was made all the same
         start = self._declare(START_SPECS)
         self._values = self._declare(parameter_specs())
-        refuse_unknown_parameters(self)
+        refuse_undeclared(self)
         self._team = build_team(start, robots)
         self._scenario = str(start["fault_scenario"])
         self._endless = not start["follow_sim"]

@@ -1,8 +1,7 @@
 """Messages to and from the core's types.
 
 Commands and observations stay in the form in which they travel: making Python message objects of
-them took more than half of the gate's time. The layout is plain little-endian CDR (OMG DDS-RTPS
-2.5, section 10; XCDR version 1); a test holds it against rclpy's own serialization.
+them took more than half of the gate's time; see crash_coach_common.cdr.
 """
 
 from __future__ import annotations
@@ -18,6 +17,15 @@ from crash_coach_interfaces.msg import EpisodeState, FaultEvent
 from crash_coach_interfaces.msg import Fault as FaultMessage
 from std_msgs.msg import Header
 
+from crash_coach_common.cdr import (
+    COMMANDED,
+    COUNT,
+    ENCAPSULATION_SIZE,
+    FRAME_ID_AT,
+    OBSERVED,
+    body_at,
+    cut_short,
+)
 from crash_coach_common.contract import UserError
 from crash_coach_pkg.effects import NO_ACTION
 from crash_coach_pkg.faults import fault_mode, mode_code
@@ -26,16 +34,9 @@ from crash_coach_pkg.gate.plan_book import TEAM, Event
 from crash_coach_pkg.plan import NEXT_STEP, CrashPlan, Fault, Trigger, TriggerKind
 from crash_coach_pkg.schedule import World
 
-# Encapsulation (4 bytes), stamp (8), length of frame_id (4), frame_id, padding to 4, fields.
-_LITTLE_ENDIAN = b"\x00\x01"
-_ENCAPSULATION_SIZE = 4
 _FLAGS = struct.Struct("<???")  # terminated, truncated, success
-_LENGTH = struct.Struct("<I")
 _STAMP = struct.Struct("<iI")
-_FRAME_ID_AT = 16
-_COMMANDED = struct.Struct("<IIiiB")  # episode, step, action, worst_action, fault
 _FAULT_AT = 16
-_OBSERVED = struct.Struct("<IIiI")  # episode, step, last_action, number of features
 
 
 def message_from_plan(
@@ -113,25 +114,13 @@ def command_from_bytes(robot: int, data: bytes) -> Command:
     Raises:
         UserError: not little-endian CDR, cut short, or of a step that is no step.
     """
-    start = _body("command", data)
-    if len(data) < start + _COMMANDED.size:
+    start = body_at("command", data)
+    if len(data) < start + COMMANDED.size:
         raise UserError(f"command of {len(data)} bytes is cut short")
-    episode, step, action, worst, _ = _COMMANDED.unpack_from(data, start)
+    episode, step, action, worst, _ = COMMANDED.unpack_from(data, start)
     if step == NEXT_STEP:  # the step after it would not fit the messages
         raise UserError(f"command of step {step}: steps are below {NEXT_STEP}")
     return Command(robot, episode, step, action, worst, (data, start))
-
-
-def _body(what: str, data: bytes) -> int:
-    """Where a message's fields start behind its header."""
-    if data[:2] != _LITTLE_ENDIAN:
-        raise UserError(f"{what}: encapsulation {data[:2].hex()} is not little-endian CDR")
-    try:
-        (length,) = _LENGTH.unpack_from(data, _FRAME_ID_AT - _LENGTH.size)
-    except struct.error as error:
-        raise UserError(f"{what} of {len(data)} bytes is cut short: {error}") from error
-    start: int = _FRAME_ID_AT + (length + 3 & ~3)
-    return start
 
 
 def bytes_from_decision(decision: Decision) -> bytes:
@@ -141,7 +130,7 @@ def bytes_from_decision(decision: Decision) -> bytes:
     if not decision.mode and data[start + _FAULT_AT] == 0:
         return data
     command = decision.command
-    return data[:start] + _COMMANDED.pack(
+    return data[:start] + COMMANDED.pack(
         command.episode, command.step, decision.applied, command.worst, mode_code(decision.mode)
     )
 
@@ -150,9 +139,9 @@ def effect_from_decision(decision: Decision, robots: tuple[str, ...]) -> FaultEv
     command = decision.command
     data: bytes
     data, _ = command.token
-    sec, nanosec = _STAMP.unpack_from(data, _ENCAPSULATION_SIZE)
-    (length,) = _LENGTH.unpack_from(data, _FRAME_ID_AT - _LENGTH.size)
-    frame_id = data[_FRAME_ID_AT : _FRAME_ID_AT + length].rstrip(b"\0").decode()
+    sec, nanosec = _STAMP.unpack_from(data, ENCAPSULATION_SIZE)
+    (length,) = COUNT.unpack_from(data, FRAME_ID_AT - COUNT.size)
+    frame_id = data[FRAME_ID_AT : FRAME_ID_AT + length].rstrip(b"\0").decode()
     return FaultEvent(
         header=Header(stamp=Time(sec=sec, nanosec=nanosec), frame_id=frame_id),
         kind=FaultEvent.EFFECT,
@@ -173,16 +162,17 @@ def sight_from_bytes(robot: int, data: bytes) -> Sight:
     Raises:
         UserError: not little-endian CDR, cut short, or of a step that is no step.
     """
-    start = _body("observation", data)
+    start = body_at("observation", data)
     try:
-        episode, step, _, count = _OBSERVED.unpack_from(data, start)
-        features_at = start + _OBSERVED.size
+        episode, step, _ = OBSERVED.unpack_from(data, start)
+        (count,) = COUNT.unpack_from(data, start + OBSERVED.size)
+        features_at = start + OBSERVED.size + COUNT.size
         features = np.frombuffer(data, np.float32, count, features_at)
-        (n_actions,) = _LENGTH.unpack_from(data, features_at + 4 * count)
-        available_at = features_at + 4 * count + _LENGTH.size
+        (n_actions,) = COUNT.unpack_from(data, features_at + 4 * count)
+        available_at = features_at + 4 * count + COUNT.size
         available = np.frombuffer(data, np.uint8, n_actions, available_at) != 0
     except (struct.error, ValueError) as error:
-        raise UserError(f"observation of {len(data)} bytes is cut short: {error}") from error
+        raise cut_short("observation", data, error) from error
     if step == NEXT_STEP:
         raise UserError(f"observation of step {step}: steps are below {NEXT_STEP}")
     return Sight(robot, episode, step, features, available, (data, features_at))
@@ -224,24 +214,21 @@ def played_from_bytes(data: bytes) -> Played:
     Raises:
         UserError: not little-endian CDR, or cut short.
     """
-    if data[:2] != _LITTLE_ENDIAN:
-        raise UserError(f"episode: encapsulation {data[:2].hex()} is not little-endian CDR")
+    start = body_at("episode", data)
     try:
-        (length,) = _LENGTH.unpack_from(data, _FRAME_ID_AT - _LENGTH.size)
-        start = _FRAME_ID_AT + (length + 3 & ~3)
-        (episode,) = _LENGTH.unpack_from(data, start)
+        (episode,) = COUNT.unpack_from(data, start)
         count_at = _align_8(start + 8) + 8  # behind episode, step and seed
-        (count,) = _LENGTH.unpack_from(data, count_at)
+        (count,) = COUNT.unpack_from(data, count_at)
         flags_at = _align_8(count_at + 4 + 4 * count) + 16  # behind state, reward, return
         terminated, truncated, success = _FLAGS.unpack_from(data, flags_at)
     except struct.error as error:
-        raise UserError(f"episode of {len(data)} bytes is cut short: {error}") from error
+        raise cut_short("episode", data, error) from error
     return Played(episode, terminated or truncated, success)
 
 
 def _align_8(offset: int) -> int:
     """CDR aligns from behind the encapsulation."""
-    return (offset - _ENCAPSULATION_SIZE + 7 & ~7) + _ENCAPSULATION_SIZE
+    return (offset - ENCAPSULATION_SIZE + 7 & ~7) + ENCAPSULATION_SIZE
 
 
 def message_from_event(event: Event, robots: tuple[str, ...], stamp: Time) -> FaultEvent:

@@ -16,8 +16,9 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from crash_coach_common.contract import UserError
-from crash_coach_common.ros.parameters import CheckedParameterService
-from crash_coach_common.ros.run_node import EVENTS, PLAN, TICK_S, refuse_unknown_parameters
+from crash_coach_common.ros.parameters import CheckedParameterService, refuse_undeclared
+from crash_coach_common.ros.qos import EVENTS, PLAN
+from crash_coach_common.ros.run_node import TICK_S
 from crash_coach_pkg.gate.health import Decided, Report, RobotState, TeamHealth
 from crash_coach_pkg.gate.plan_book import Event, EventKind, PlanBook
 from crash_coach_pkg.plan import CrashPlan
@@ -147,7 +148,7 @@ class GateBase(Node):
         Raises:
             UserError: a parameter that neither this node nor the gate has declared.
         """
-        refuse_unknown_parameters(self)
+        refuse_undeclared(self)
         self._gate = gate
         self.create_subscription(CrashPlanMessage, "coach/plan", self._on_plan, PLAN)
         steady = Clock(clock_type=ClockType.STEADY_TIME)

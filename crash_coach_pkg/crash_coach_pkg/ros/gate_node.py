@@ -14,7 +14,8 @@ from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from crash_coach_common.contract import UserError
-from crash_coach_common.ros.run_node import EPISODE, NEWEST, spin
+from crash_coach_common.ros.qos import EPISODE, NEWEST
+from crash_coach_common.ros.run_node import spin
 from crash_coach_pkg.effects import WITHHELD
 from crash_coach_pkg.gate.action_gate import GateState
 from crash_coach_pkg.gate.health import Decided

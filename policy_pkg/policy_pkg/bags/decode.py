@@ -15,13 +15,11 @@ from rosbags.typesys import (
 )
 from rosbags.typesys.store import Typestore
 
+from crash_coach_common.cdr import body_at, cut_short
 from policy_pkg.bags.records import Channel
 from policy_pkg.bags.topics import TYPES, Kind
 
-_LITTLE_ENDIAN = b"\x00\x01"
-_U32 = struct.Struct("<I")
 _KEY = struct.Struct("<II")  # episode, step
-_FRAME_ID_AT = 16  # encapsulation (4 bytes), stamp (8), length of frame_id (4)
 _MAX_SEQUENCE = 1 << 24
 _READ = {
     Kind.OBSERVATION: ("header", "episode", "step", "last_action", "features", "available_actions"),
@@ -106,13 +104,11 @@ def key_of(data: bytes) -> tuple[int, int]:
     """(episode, step) of a message that begins with header, episode, step; the rest stays as it is.
 
     Raises:
-        ValueError: not little-endian CDR, or too short.
+        UserError: not little-endian CDR, or too short.
     """
-    if data[:2] != _LITTLE_ENDIAN:
-        raise ValueError(f"encapsulation {data[:2].hex()} is not little-endian CDR")
+    start = body_at("a message", data)
     try:
-        (length,) = _U32.unpack_from(data, _FRAME_ID_AT - 4)
-        episode, step = _KEY.unpack_from(data, _FRAME_ID_AT + (length + 3 & ~3))
+        episode, step = _KEY.unpack_from(data, start)
     except struct.error as error:
-        raise ValueError(f"a message of {len(data)} bytes is cut short") from error
+        raise cut_short("a message", data, error) from error
     return episode, step

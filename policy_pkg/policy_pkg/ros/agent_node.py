@@ -2,36 +2,23 @@
 
 from __future__ import annotations
 
-import gc
-import signal
-import sys
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
-from types import FrameType
 
-import rclpy
 from crash_coach_interfaces.msg import Action, Observation
 from rclpy.context import Context
-from rclpy.exceptions import ParameterException
-from rclpy.experimental import EventsExecutor
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
-from rclpy.signals import SignalHandlerOptions
 
 from crash_coach_common.contract import UserError
+from crash_coach_common.ros.qos import NEWEST
+from crash_coach_common.ros.run_node import run, serving
 from policy_pkg.act import Exploration, greedy, least_valued
 from policy_pkg.agent import Agent
-from policy_pkg.checkpoint import CheckpointError, load_policy
+from policy_pkg.checkpoint import load_policy
 from policy_pkg.ros.agent_params import PolicyParameters, TeamParameters, read_parameters
 from policy_pkg.ros.convert import bytes_from_answer, sensed_from_bytes
 from policy_pkg.ros.weights_link import Receive, WeightsLink
-
-NEWEST = QoSProfile(depth=1)  # reliable: an observation or command replaces the one before
-SPIN_S = 0.1  # how soon a signal is noticed
-RCLError: type[Exception] = rclpy_implementation.RCLError  # bad --ros-args, for one
 
 
 class AgentNode(Node):
@@ -95,33 +82,16 @@ class AgentNode(Node):
 
 def spin(make_node: Callable[[], AgentNode]) -> int:
     """Runs a node until SIGINT or SIGTERM; returns the exit code, 1 after one line of error."""
-    received: list[int] = []
 
-    def note(number: int, frame: FrameType | None) -> None:
-        received.append(number)
+    def body(received: list[int]) -> None:
+        with serving() as served:
+            node = served.add(make_node())
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, note)
-    executor = node = None
-    try:
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        executor = EventsExecutor()
-        node = make_node()
-        executor.add_node(node)
-        gc.freeze()  # what was loaded so far stays: no collection need look at it again
-        while not received:
-            executor.spin_once(timeout_sec=SPIN_S)
-            if node.failure is not None:
-                raise node.failure
-    except (UserError, CheckpointError, ParameterException, RCLError) as error:
-        program = Path(sys.argv[0]).name
-        print(f"{program}: error: {error}", file=sys.stderr)  # noqa: T201
-        return 1
-    finally:
-        # In this order: DDS must not call back into what is gone (the executor first lets go).
-        if executor is not None:
-            executor.shutdown()
-        if node is not None:
-            node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
+            def done() -> object:
+                if node.failure is not None:
+                    raise node.failure
+                return received
+
+            served.until(done)
+
+    return run(body)

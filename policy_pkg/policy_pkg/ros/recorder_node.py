@@ -2,30 +2,23 @@
 
 from __future__ import annotations
 
-import gc
 import os
-import signal
 import sys
 import time
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
-import rclpy
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from crash_coach_interfaces.msg import Action, CrashPlan, EpisodeState, FaultEvent, Observation
 from nav_msgs.msg import Odometry
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.exceptions import ParameterException
-from rclpy.experimental import EventsExecutor
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
 from crash_coach_common.contract import UserError
+from crash_coach_common.ros.run_node import run, serving
 from policy_pkg.bags.about import About
 from policy_pkg.bags.recorder import Recorder
 from policy_pkg.bags.topics import INTERFACES, Connection, connections, load_typestore
@@ -44,7 +37,6 @@ _CLASSES = {
         Action, Clock, CrashPlan, EpisodeState, FaultEvent, Observation, Odometry,
     )
 }  # fmt: skip
-RCLError: type[Exception] = rclpy_implementation.RCLError  # bad --ros-args, for one
 
 
 class RecorderNode(Node):
@@ -151,48 +143,26 @@ def _list(drops: dict[str, int]) -> str:
     return ", ".join(f"{topic} {count}" for topic, count in drops.items())
 
 
-def _record(received: list[int]) -> str:
-    """Records until a signal comes or it is done; returns a line about the recording."""
-    executor, node = EventsExecutor(), None
-    try:
-        node = RecorderNode()
-        executor.add_node(node)
-        gc.freeze()  # what was loaded so far stays: no collection need look at it again
-        node.get_logger().info("recording")
-        while not received and not node.done:
-            executor.spin_once(timeout_sec=SPIN_S)
-        end_s = time.monotonic() + _LINGER_S
-        while not received and (left_s := end_s - time.monotonic()) > 0:
-            executor.spin_once(timeout_sec=left_s)
-    finally:
-        # In this order: DDS must not call back into what is gone (the executor first lets go).
-        executor.shutdown()
-        summary = node.finish() if node is not None else ""
-        if node is not None:
-            node.destroy_node()
-    return summary
+def _record(received: list[int]) -> None:
+    """Records until a signal comes or it is done; says what became of it."""
+    with serving() as served:
+        node = served.add(RecorderNode())
+        try:
+            node.get_logger().info("recording")
+            served.until(lambda: received or node.done)
+            end_s = time.monotonic() + _LINGER_S
+            served.until(lambda: received or time.monotonic() >= end_s)
+        finally:
+            served.executor.shutdown()
+            summary = node.finish()
+    print(f"recorder: {summary}", flush=True)  # noqa: T201
 
 
 def main() -> int:
     """Exit code 0 at the end or on SIGINT or SIGTERM; 1 after one line of error."""
-    received: list[int] = []
-
-    def note(number: int, frame: FrameType | None) -> None:
-        received.append(number)
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, note)
     # Read when the first node is made. Whoever set it knows better.
     os.environ.setdefault(PROFILE_VARIABLE, str(PROFILE))
-    try:
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        print(f"recorder: {_record(received)}", flush=True)  # noqa: T201
-    except (UserError, ParameterException, RCLError) as error:
-        print(f"recorder: error: {error}", file=sys.stderr)  # noqa: T201
-        return 1
-    finally:
-        rclpy.try_shutdown()
-    return 0
+    return run(_record, "recorder")
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from rclpy.node import Node
 
 from crash_coach_common.contract import UserError
-from policy_pkg.ros.node_params import read_model, require
+from crash_coach_common.ros.parameters import read_model, require
 
 _NOT_TOLD = -1
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")

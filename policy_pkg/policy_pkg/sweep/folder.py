@@ -11,11 +11,7 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
-import os
-import socket
-import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -25,13 +21,12 @@ from typing import Literal
 
 from pydantic import ValidationError
 
-from policy_pkg.checkpoint import CHECKPOINTS, list_checkpoints
+from crash_coach_common.locks import TakenError, held
 from policy_pkg.sweep.config import SweepRun
 from policy_pkg.train.config import TrainConfig
-from policy_pkg.train.run_dir import RUN, RunError, check_same, read_run
+from policy_pkg.train.run_dir import RUN, RunError, check_same, newest_step, read_run
 
 HIDDEN = ".sweep"
-LOCK_POLL_S = 0.2
 # Where it matters not for what is learned, a run may have been done with another setting.
 NO_MATTER = {"tensorboard", "checkpoint_interval_steps", "checkpoint_replay"}
 
@@ -150,12 +145,6 @@ def standing(run: SweepRun, out: Path, have: Sequence[Path] = ()) -> Standing:
     return Standing("started", steps, folder, remark)
 
 
-def newest_step(folder: Path) -> int:
-    """Of the newest checkpoint; 0 where there is none."""
-    found = list_checkpoints(folder / CHECKPOINTS)
-    return int(found[-1].name.removeprefix("step_")) if found else 0
-
-
 def _why_not(run: SweepRun, place: Path) -> str | None:
     """Why the run in ``place`` is not a finished ``run``; None: it is."""
     content = read_run(place)
@@ -215,30 +204,8 @@ def exclusive(
         OSError: it cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     try:
-        deadline = time.monotonic() + wait_s
-        while not _taken(descriptor):
-            if time.monotonic() >= deadline:
-                holder = os.pread(descriptor, 200, 0).decode(errors="replace").strip()
-                raise RunError(f"{taken} by another process ({holder or 'unknown'})")
-            waiting()
-            waiting = _nothing
-            time.sleep(LOCK_POLL_S)
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
-        yield
-    finally:
-        os.close(descriptor)
-
-
-def _nothing() -> None:
-    pass
-
-
-def _taken(descriptor: int) -> bool:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
+        with held(path, wait_s, waiting):
+            yield
+    except TakenError as error:
+        raise RunError(f"{taken} by another process ({error})") from None

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING
 
 from crash_coach_common.contract import UserError
 from policy_pkg.checkpoint import CHECKPOINTS, list_checkpoints
-from policy_pkg.sweep.folder import RunFiles, RunProgress, exclusive, newest_step, write_progress
+from policy_pkg.sweep.folder import RunFiles, RunProgress, exclusive, write_progress
 from policy_pkg.sweep.task import Task
+from policy_pkg.train.run_dir import newest_step
 
 if TYPE_CHECKING:
     from policy_pkg.train.run import ProgressReport

@@ -13,9 +13,7 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
-import os
 import platform
 import re
 import subprocess
@@ -28,8 +26,9 @@ from pathlib import Path
 from typing import Any
 
 from crash_coach_common.contract import UserError
+from crash_coach_common.locks import TakenError, held
 from crash_coach_common.strict_yaml import ConfigError
-from policy_pkg.checkpoint import CHECKPOINTS, PolicyBundle
+from policy_pkg.checkpoint import CHECKPOINTS, PolicyBundle, list_checkpoints
 from policy_pkg.kernels import kernels
 from policy_pkg.learner import native
 from policy_pkg.train.config import TrainConfig
@@ -258,6 +257,12 @@ def checkpoint_path(out_dir: Path, env_steps: int, kind: str = CHECKPOINTS) -> P
     return out_dir / kind / f"step_{env_steps:09d}"
 
 
+def newest_step(folder: Path) -> int:
+    """Of the newest checkpoint; 0 where there is none."""
+    found = list_checkpoints(folder / CHECKPOINTS)
+    return int(found[-1].name.removeprefix("step_")) if found else 0
+
+
 def seedless_name(run: Path) -> str:
     """The folder's name without -s<seed>."""
     return re.sub(r"(?<=.)-s\d+$", "", run.resolve().name)
@@ -270,12 +275,8 @@ def locked(out_dir: Path) -> Iterator[None]:
     Raises:
         RunError: another process holds it.
     """
-    descriptor = os.open(out_dir / RUN, os.O_RDONLY | os.O_CLOEXEC)
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise RunError(f"{out_dir} is being trained by another process") from None
-        yield
-    finally:
-        os.close(descriptor)
+        with held(out_dir / RUN, signed=False):
+            yield
+    except TakenError:
+        raise RunError(f"{out_dir} is being trained by another process") from None

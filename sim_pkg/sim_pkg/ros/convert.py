@@ -1,10 +1,9 @@
 """Core types to messages: no Node, no publishing.
 
 Observations and commands, of which there is one per robot and step, stay in the form in which they
-travel: Python message objects took more than half of a step's time. Their layout is plain
-little-endian CDR (OMG DDS-RTPS 2.5, section 10; XCDR version 1); a test holds it against rclpy's
-own serialization. Other message objects are made once, and what changes in every step is written
-through numpy views of their arrays.
+travel: Python message objects took more than half of a step's time; see crash_coach_common.cdr.
+Other message objects are made once, and what changes in every step is written through numpy views
+of their arrays.
 """
 
 from __future__ import annotations
@@ -24,7 +23,8 @@ from nav_msgs.msg import Odometry
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from crash_coach_common.contract import EnvSpec, UserError
+from crash_coach_common.cdr import COMMANDED, COUNT, LITTLE_ENDIAN, OBSERVED, body_at, cut_short
+from crash_coach_common.contract import EnvSpec
 from sim_pkg.lockstep import Decisions, Health
 from sim_pkg.realtime import NewestCommands
 from sim_pkg.render.frames import Side, actors, vitals
@@ -32,13 +32,7 @@ from sim_pkg.scenarios.base import Scene
 from sim_pkg.session import Session
 
 MAP_FRAME = "map"
-# Encapsulation (4 bytes), stamp (8), length of frame_id (4), frame_id, padding to 4, fields.
-_LITTLE_ENDIAN = b"\x00\x01"
-_HEAD = struct.Struct("<4siII")
-_COUNT = struct.Struct("<I")
-_FRAME_ID_AT = 16
-_OBSERVED = struct.Struct("<IIi")  # episode, step, last_action
-_COMMANDED = struct.Struct("<IIiiB")  # episode, step, action, worst_action, fault
+_HEAD = struct.Struct("<4siII")  # encapsulation, stamp, length of frame_id
 _NS_PER_S = 1_000_000_000
 _RED = ColorRGBA(r=0.85, g=0.15, b=0.15, a=1.0)
 _BLUE = ColorRGBA(r=0.2, g=0.4, b=0.85, a=1.0)
@@ -89,14 +83,11 @@ def command_from_bytes(data: bytes) -> Commanded:
     Raises:
         UserError: not little-endian CDR, or cut short.
     """
-    if data[:2] != _LITTLE_ENDIAN:
-        raise UserError(f"command: encapsulation {data[:2].hex()} is not little-endian CDR")
+    start = body_at("command", data)
     try:
-        (length,) = _COUNT.unpack_from(data, _FRAME_ID_AT - _COUNT.size)
-        start = _FRAME_ID_AT + (length + 3 & ~3)
-        episode, step, action, _, fault = _COMMANDED.unpack_from(data, start)
+        episode, step, action, _, fault = COMMANDED.unpack_from(data, start)
     except struct.error as error:
-        raise UserError(f"command of {len(data)} bytes is cut short: {error}") from error
+        raise cut_short("command", data, error) from error
     return Commanded(episode, step, action, fault)
 
 
@@ -107,14 +98,14 @@ class ObservationWriter:
         self._header = header
         self._frame_id = header.frame_id.encode() + b"\0"
         self._padding = b"\0" * (-len(self._frame_id) % 4)
-        self._n_features = _COUNT.pack(spec.obs_size)
-        self._n_actions = _COUNT.pack(spec.n_actions)
+        self._n_features = COUNT.pack(spec.obs_size)
+        self._n_actions = COUNT.pack(spec.n_actions)
         self.messages: list[bytes] = [b""] * spec.n_robots
 
     def fill(self, session: Session) -> None:
         stamp = self._header.stamp
         head = (
-            _HEAD.pack(_LITTLE_ENDIAN, stamp.sec, stamp.nanosec, len(self._frame_id))
+            _HEAD.pack(LITTLE_ENDIAN, stamp.sec, stamp.nanosec, len(self._frame_id))
             + self._frame_id
             + self._padding
         )
@@ -123,7 +114,7 @@ class ObservationWriter:
             self.messages[i] = b"".join(
                 (
                     head,
-                    _OBSERVED.pack(session.episode, session.step, last_action),
+                    OBSERVED.pack(session.episode, session.step, last_action),
                     self._n_features,
                     obs[i].tobytes(),
                     self._n_actions,

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from crash_coach_common.contract import UserError
+from crash_coach_common.locks import TakenError, held
 
-class SecondSimError(RuntimeError):
+
+class SecondSimError(UserError):
     """Another sim runs on this domain."""
 
 
@@ -25,16 +27,11 @@ def only_sim(domain: int) -> Iterator[None]:
         SecondSimError: another process holds it; names its process id.
     """
     path = Path(tempfile.gettempdir()) / f"crash_coach_sim_{os.getuid()}_{domain}.lock"
-    with path.open("a+") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            lock.seek(0)
-            raise SecondSimError(
-                f"another sim (process {lock.read().strip() or 'unknown'}) runs on ROS domain "
-                f"{domain}; stop it, or set another ROS_DOMAIN_ID"
-            ) from None
-        lock.truncate(0)
-        lock.write(str(os.getpid()))
-        lock.flush()
-        yield
+    try:
+        with held(path):
+            yield
+    except TakenError as error:
+        raise SecondSimError(
+            f"another sim ({error}) runs on ROS domain {domain}; stop it, or set another "
+            "ROS_DOMAIN_ID"
+        ) from None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import sys
 import time
 from enum import Enum
 
@@ -11,28 +9,24 @@ import rclpy
 from crash_coach_interfaces.msg import FaultEvent
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.exceptions import InvalidParameterException
-from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
 from crash_coach_common.contract import UserError
-from crash_coach_common.strict_yaml import ConfigError
+from crash_coach_common.ros.run_node import run, serving
 from sim_pkg.env import make_env
 from sim_pkg.lockstep import Decisions
 from sim_pkg.pause import Pause
 from sim_pkg.realtime import NewestCommands
 from sim_pkg.ros import convert
 from sim_pkg.ros.arena_view import ArenaView
-from sim_pkg.ros.sim_lock import SecondSimError, only_sim
+from sim_pkg.ros.sim_lock import only_sim
 from sim_pkg.ros.sim_params import read_parameters
 from sim_pkg.ros.sim_topics import SimTopics
 from sim_pkg.session import Session
 
 _POLL_S = 0.05
 _HOUSEKEEPING_S = 1.0
-_SPIN_S = 0.1
 
 
 class _Phase(Enum):
@@ -259,35 +253,16 @@ class SimNode(Node):
         return response
 
 
-def _run(stopped: list[int]) -> str | None:
-    """Spins a sim until it is done, fails (returns why) or is stopped."""
-    node = SimNode()
-    executor = EventsExecutor()
-    executor.add_node(node)
-    try:
-        while not stopped and not node.done:
-            executor.spin_once(timeout_sec=_SPIN_S)
+def _run(received: list[int]) -> None:
+    """Serves a sim until it is done or stopped. Raises UserError saying why it failed."""
+    with only_sim(rclpy.get_default_context().get_domain_id()), serving() as served:
+        node = served.add(SimNode())
+        served.until(lambda: received or node.done)
         node.finish()
-    finally:
-        # In this order: DDS must not call back into what is gone (the executor first lets go).
-        executor.shutdown()
-        node.destroy_node()
-    return node.failure
+    if node.failure is not None:
+        raise UserError(node.failure)
 
 
-def main() -> None:
+def main() -> int:
     """Entry point of ``ros2 run sim_pkg sim``; exit code 0 at the end or on a signal, else 1."""
-    stopped: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda n, _: stopped.append(n))
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        with only_sim(rclpy.get_default_context().get_domain_id()):
-            failure = _run(stopped)
-    except (ConfigError, InvalidParameterException, SecondSimError) as error:
-        failure = str(error)
-    finally:
-        rclpy.try_shutdown()
-    if failure is not None:
-        print(f"sim: error: {failure}", file=sys.stderr)  # noqa: T201
-        sys.exit(1)
+    return run(_run, "sim")

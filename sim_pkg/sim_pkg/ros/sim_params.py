@@ -7,12 +7,8 @@ from typing import Literal
 from pydantic import ConfigDict, Field
 from rclpy.node import Node
 
-from crash_coach_common.ros.parameters import (
-    CheckedParameterService,
-    declare_model,
-    unknown_parameter,
-)
-from crash_coach_common.strict_yaml import ConfigError, StrictModel, did_you_mean
+from crash_coach_common.ros.parameters import read_model
+from crash_coach_common.strict_yaml import StrictModel
 
 
 class SimParameters(StrictModel):
@@ -53,13 +49,6 @@ def read_parameters(node: Node) -> SimParameters:
     returns what was set on the command line.
 
     Raises:
-        ConfigError: an unknown name, a wrong type, NaN, or a value out of range.
+        UserError: an unknown name, a wrong type, NaN, or a value out of range.
     """
-    CheckedParameterService(node)
-    known = SimParameters.model_fields
-    name = unknown_parameter(node, known)
-    if name is not None:
-        raise ConfigError(
-            f"unknown parameter {name!r}{did_you_mean(name, known)}; known: {', '.join(known)}"
-        )
-    return declare_model(node, SimParameters)
+    return read_model(node, SimParameters)

@@ -6,16 +6,17 @@ import queue
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
 from crash_coach_interfaces.msg import BlockResult, EpisodeState, PolicyStatus
-from rcl_interfaces.srv import GetParameters
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 
 from crash_coach_common.contract import EnvSpec, UserError
+from crash_coach_common.ros.greet import greet
 from policy_pkg.bags.dataset import RecordedEpisode
 from policy_pkg.ros.trainer.topics import Heard, RobotMessages, TrainerTopics
 from policy_pkg.train.live.inbox import Inbox, Lost
@@ -23,7 +24,6 @@ from policy_pkg.train.live.order import Task
 
 SPIN_S = 0.05  # how soon a signal, or what another thread gave, is noticed
 START_S = 120.0  # until the nodes of a graph are there; a cold start compiles
-ASK_AGAIN_S = 0.3
 ACK_S = 5.0
 ACK_POLL_S = 0.002
 EPISODE_S = 60.0  # the sim itself gives up sooner where robots do not answer
@@ -47,6 +47,10 @@ class Graph:
     observation_topic: str
     seed: int
     coached: bool
+
+
+class _Stopped(Exception):
+    """The run ends: nobody has to be greeted any more."""
 
 
 class GraphLink:
@@ -139,19 +143,14 @@ class GraphLink:
 
     def _greet(self, target: str) -> None:
         """Returns when ``target`` knows this node: then nothing that it says is lost."""
-        client = self._node.create_client(GetParameters, f"{target}/get_parameters")
-        deadline = time.monotonic() + START_S
-        while not self._stopped() and time.monotonic() < deadline:
-            ready = client.service_is_ready()
-            answer = client.call_async(GetParameters.Request()) if ready else None
-            again = time.monotonic() + ASK_AGAIN_S
-            while (left_s := again - time.monotonic()) > 0:
-                if answer is not None and answer.done():
-                    self._node.destroy_client(client)
-                    return
-                self._executor.spin_once(timeout_sec=min(SPIN_S, left_s))
-        if not self._stopped():
-            raise UserError(f"{self._name}: waited {START_S:g} s for {target}")
+
+        def spin_once(spin_s: float) -> None:
+            if self._stopped():
+                raise _Stopped
+            self._executor.spin_once(timeout_sec=spin_s)
+
+        with suppress(_Stopped):
+            greet(self._node, target, spin_once, START_S, f"{target} of {self._name}")
 
     @property
     def _name(self) -> str:

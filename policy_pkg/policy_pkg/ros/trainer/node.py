@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
-from types import FrameType
 
-import rclpy
-from rclpy.exceptions import ParameterException
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 
 from crash_coach_common.contract import UserError
+from crash_coach_common.ros.run_node import run
 from policy_pkg.ros.recorder_node import PROFILE, PROFILE_VARIABLE
 from policy_pkg.ros.trainer.params import TrainerParameters, read_parameters
 from policy_pkg.train.config import TrainConfig, load_train_config
-
-RCLError: type[Exception] = rclpy_implementation.RCLError  # bad --ros-args, for one
 
 
 def load_config(parameters: TrainerParameters) -> TrainConfig:
@@ -35,40 +28,28 @@ def load_config(parameters: TrainerParameters) -> TrainConfig:
 
 
 def _parameters() -> TrainerParameters:
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node = Node("trainer", start_parameter_services=False)
     try:
-        node = Node("trainer", start_parameter_services=False)
-        try:
-            return read_parameters(node)
-        finally:
-            node.destroy_node()
+        return read_parameters(node)
     finally:
-        rclpy.try_shutdown()
+        node.destroy_node()
+
+
+def _train(received: list[int]) -> None:
+    parameters = _parameters()
+    config = load_config(parameters)
+    # Only now: it loads torch, which takes longer than finding out what is wrong.
+    from policy_pkg.ros.trainer.trainer import Trainer
+
+    Trainer(parameters, config).run(received)
 
 
 def main() -> int:
     """Exit code 0 at the end or on SIGINT or SIGTERM; 1 after one line of error."""
-    received: list[int] = []
-
-    def note(number: int, frame: FrameType | None) -> None:
-        received.append(number)
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, note)
     # Read when the first node is made. Whoever set it knows better. As the recorder's: a deep queue
     # for what comes while this process is busy.
     os.environ.setdefault(PROFILE_VARIABLE, str(PROFILE))
-    try:
-        parameters = _parameters()
-        config = load_config(parameters)
-        # Only now: it loads torch, which takes longer than finding out what is wrong.
-        from policy_pkg.ros.trainer.trainer import Trainer
-
-        Trainer(parameters, config).run(received)
-    except (UserError, ParameterException, RCLError) as error:
-        print(f"trainer: error: {error}", file=sys.stderr)  # noqa: T201
-        return 1
-    return 0
+    return run(_train, "trainer")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from rclpy.node import Node
 
 from crash_coach_common.contract import UserError
-from policy_pkg.ros.node_params import read_model, require
+from crash_coach_common.ros.parameters import read_model, require
 
 OWN_DOMAIN = -1
 NOTHING = "none"

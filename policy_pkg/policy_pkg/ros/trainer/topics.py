@@ -25,6 +25,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 
 from crash_coach_common.contract import EnvSpec
+from crash_coach_common.ros.qos import BLOCKS
 from policy_pkg.bags.decode import key_of
 from policy_pkg.bags.records import Channel
 from policy_pkg.bags.topics import TYPES, Kind
@@ -33,7 +34,6 @@ from policy_pkg.ros.weights_link import STATUS, STATUS_TOPIC, WEIGHTS, WEIGHTS_T
 from policy_pkg.train.live.inbox import Inbox
 
 BLOCKS_TOPIC = "/trainer/blocks"
-BLOCKS = QoSProfile(depth=10)
 # A sim in lock-step does not wait for this process, whose threads share one interpreter.
 DEEP = QoSProfile(depth=2000)
 DEEP_LATCHED = QoSProfile(depth=2000, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+
+from crash_coach_common.locks import TakenError, held
 
 # Domains whose ports stay below Linux' ephemeral range.
 DOMAINS = range(10, 100)
@@ -23,10 +24,10 @@ def reserve_domain() -> Iterator[int]:
     folder = Path(tempfile.gettempdir()) / f"crash_coach_domains_{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
     for domain in DOMAINS:
-        with open(folder / str(domain), "w") as lock:
+        with ExitStack() as stack:
             try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+                stack.enter_context(held(folder / str(domain)))
+            except TakenError:
                 continue
             yield domain
             return

@@ -6,7 +6,7 @@ parameter without a name. Here both are refused.
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable
+from collections.abc import Iterable
 from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -16,7 +16,8 @@ from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter_service import ParameterService
 
-from crash_coach_common.strict_yaml import ConfigError
+from crash_coach_common.contract import UserError
+from crash_coach_common.strict_yaml import ConfigError, did_you_mean
 
 LAST_TYPE = ParameterType.PARAMETER_STRING_ARRAY
 _OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides")
@@ -24,10 +25,20 @@ _OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides")
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def unknown_parameter(node: Node, known: Container[str]) -> str | None:
-    """The first parameter that was set at the start and is neither ``known`` nor rclpy's own."""
-    names = node._parameter_overrides
-    return next((n for n in names if n not in known and n.split(".")[0] not in _OF_RCLPY), None)
+def refuse_unknown(node: Node, known: Iterable[str]) -> None:
+    """Raises UserError for a parameter set at the start, neither ``known`` nor rclpy's own."""
+    names = tuple(known)
+    for name in node._parameter_overrides:
+        if name not in names and name.split(".")[0] not in _OF_RCLPY:
+            raise UserError(
+                f"unknown parameter {name!r}{did_you_mean(name, names)} of {node.get_name()}; "
+                f"known: {', '.join(names)}"
+            )
+
+
+def refuse_undeclared(node: Node) -> None:
+    """As ``refuse_unknown``, when the node has declared all that it knows."""
+    refuse_unknown(node, sorted(node._parameters))
 
 
 def declare_model(node: Node, model: type[Model]) -> Model:
@@ -51,6 +62,27 @@ def declare_model(node: Node, model: type[Model]) -> Model:
         problem = error.errors(include_url=False)[0]
         name = ".".join(map(str, problem["loc"]))
         raise ConfigError(f"parameter {name} = {problem['input']!r}: {problem['msg']}") from error
+
+
+def read_model(node: Node, model: type[Model]) -> Model:
+    """Declares every field of ``model`` on ``node``, read-only; returns what was set at the start.
+
+    ``node`` is made without rclpy's parameter services: it gets checked ones here.
+
+    Raises:
+        UserError: an unknown name, a wrong type, a value out of range.
+    """
+    CheckedParameterService(node)
+    refuse_unknown(node, model.model_fields)
+    return declare_model(node, model)
+
+
+def require(node: Node, parameters: BaseModel, *names: str) -> None:
+    """Raises UserError for the first of ``names`` that was left empty."""
+    for name in names:
+        if getattr(parameters, name) in ("", [""]):
+            about = type(parameters).model_fields[name].description
+            raise UserError(f"parameter {name!r} of {node.get_name()} is missing: {about}")
 
 
 class CheckedParameterService(ParameterService):

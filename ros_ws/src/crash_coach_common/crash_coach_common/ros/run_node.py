@@ -1,13 +1,15 @@
-"""What executables share: parameters checked at start, an executor, an end by signal."""
+"""What executables share: an end by signal, one line of error, nodes served and let go in order."""
 
 from __future__ import annotations
 
 import gc
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
+from typing import TypeVar
 
 import rclpy
 from rclpy.exceptions import ParameterException
@@ -15,31 +17,23 @@ from rclpy.executors import Executor
 from rclpy.experimental import EventsExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
 from crash_coach_common.contract import UserError
 
-NEWEST = QoSProfile(depth=1)  # reliable: an observation or command replaces the one before
-PLAN = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-EVENTS = QoSProfile(depth=1000)  # on a busy machine readers may be that far behind
-BLOCKS = QoSProfile(depth=10)
-EPISODE = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 SPIN_S = 0.1  # how soon a signal is noticed
 TICK_S = 0.05  # steady timers for leases and heartbeats
 RCLError: type[Exception] = rclpy_implementation.RCLError  # bad --ros-args, for one
 
-
-def refuse_unknown_parameters(node: Node) -> None:
-    """Raises UserError for a parameter given at start that the node has not declared."""
-    known = ", ".join(sorted(node._parameters))
-    for name in node._parameter_overrides:
-        if not node.has_parameter(name):
-            raise UserError(f"unknown parameter {name!r} of {node.get_name()}; known: {known}")
+NodeT = TypeVar("NodeT", bound=Node)
 
 
-def spin(start: Callable[[Executor], Node]) -> int:
-    """Runs what ``start`` puts on the executor until SIGINT or SIGTERM.
+def run(body: Callable[[list[int]], None], program: str | None = None) -> int:
+    """Calls ``body`` between rclpy's start and end.
+
+    Args:
+        body: gets a list that SIGINT and SIGTERM are added to; it is to look at it often.
+        program: what errors begin with; None: the executable's name.
 
     Returns the exit code: 1 after one line of error on stderr, otherwise 0.
     """
@@ -50,23 +44,64 @@ def spin(start: Callable[[Executor], Node]) -> int:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, note)
-    executor = node = None
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        executor = EventsExecutor()
-        node = start(executor)
-        gc.freeze()  # what was loaded so far stays: no collection need look at it again
-        while not received:
-            executor.spin_once(timeout_sec=SPIN_S)
+        body(received)
     except (UserError, ParameterException, RCLError) as error:
-        program = Path(sys.argv[0]).name
-        print(f"{program}: error: {error}", file=sys.stderr)  # noqa: T201
+        print(f"{program or Path(sys.argv[0]).name}: error: {error}", file=sys.stderr)  # noqa: T201
         return 1
     finally:
-        # In this order: DDS must not call back into what is gone (the executor first lets go).
-        if executor is not None:
-            executor.shutdown()
-        if node is not None:
-            node.destroy_node()
         rclpy.try_shutdown()
     return 0
+
+
+class Serving:
+    """An executor and its nodes; ``start`` adds one."""
+
+    def __init__(self) -> None:
+        self.executor = EventsExecutor()
+        self._nodes: list[Node] = []
+
+    def add(self, node: NodeT) -> NodeT:
+        self._nodes.append(node)
+        self.executor.add_node(node)
+        return node
+
+    def start(self, start: Callable[[Executor], NodeT]) -> NodeT:
+        """``start`` makes a node and puts it on the executor."""
+        node = start(self.executor)
+        self._nodes.append(node)
+        return node
+
+    def until(self, done: Callable[[], object]) -> None:
+        """Serves until ``done()``, which may raise what went wrong."""
+        gc.freeze()  # what was loaded so far stays: no collection need look at it again
+        while not done():
+            self.executor.spin_once(timeout_sec=SPIN_S)
+
+    def close(self) -> None:
+        # In this order: DDS must not call back into what is gone (the executor first lets go).
+        self.executor.shutdown()
+        for node in self._nodes:
+            node.destroy_node()
+
+
+@contextmanager
+def serving() -> Iterator[Serving]:
+    """Nodes of this process, gone when the block is left."""
+    served = Serving()
+    try:
+        yield served
+    finally:
+        served.close()
+
+
+def spin(start: Callable[[Executor], Node]) -> int:
+    """An executable of one node, until SIGINT or SIGTERM; returns as ``run``."""
+
+    def body(received: list[int]) -> None:
+        with serving() as served:
+            served.start(start)
+            served.until(lambda: received)
+
+    return run(body)

@@ -6,11 +6,10 @@ import json
 from pathlib import Path
 
 import pytest
-from live_player import SPEC, small
+from live_player import SPEC, live, small
 from offline_recordings import Recording, buttons_recordings
-from test_live_order import live
-from test_offline_run import small as small_offline
-from test_offline_run import train_offline
+from offline_runs import small as small_offline
+from offline_runs import train_offline
 
 from policy_pkg.checkpoint import find_checkpoint, load_policy, read_manifest
 from policy_pkg.train.run import ProgressReport, train

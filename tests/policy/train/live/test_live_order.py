@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import json
-import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from live_player import SPEC, InProcess, Player, small
+from live_player import SPEC, InProcess, Player, StoppedError, live, small, wait
 
 from crash_coach_common.contract import UserError
 from policy_pkg.bags.dataset import RecordedEpisode
 from policy_pkg.checkpoint import CheckpointError, load_policy
-from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.live.order import LAG, RealTime, Task
 from policy_pkg.train.live.run import LiveRun
 from policy_pkg.train.live.session import LiveSession
-from policy_pkg.train.metrics import Value
 from policy_pkg.train.run import train
 from policy_pkg.train.run_dir import RunError
 
@@ -135,40 +132,6 @@ def test_an_episode_of_another_team_is_refused() -> None:
 
 
 # --- with files and a thread ----------------------------------------------------------------
-
-
-class StoppedError(Exception):
-    """The trainer's process dies here."""
-
-
-def wait(run: LiveRun) -> None:
-    deadline = time.monotonic() + 60
-    while not run.done:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
-def live(
-    config: TrainConfig, out: Path, resume: bool, die_after_blocks: int = 1000
-) -> list[dict[str, Value]]:
-    """A run on one graph, whose sim goes on where the checkpoint says."""
-    blocks: list[dict[str, Value]] = []
-
-    def on_block(number: int, line: dict[str, Value]) -> None:
-        blocks.append(line)
-        if len(blocks) == die_after_blocks:
-            raise StoppedError
-
-    def on_tasks(tasks: list[Task]) -> None:
-        for task in tasks:
-            run.session.played(task, player.play(task))
-
-    run = LiveRun(config, SPEC, out, resume, "lockstep", on_tasks, on_block, print)
-    with run:
-        player = Player(config, first_episode=run.session.next_episodes[0])
-        run.start()
-        wait(run)
-    return blocks
 
 
 def test_a_run_directory_serves_every_verb_and_resumes_bit_for_bit(tmp_path: Path) -> None:

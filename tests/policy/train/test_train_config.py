@@ -11,7 +11,7 @@ from crash_coach_common.strict_yaml import ConfigError, load_tree
 from policy_pkg.train.config import TrainConfig, load_train_config, train_config_names
 from sim_pkg.env import make_env
 
-SHIPPED = Path(__file__).parents[2] / "configs" / "train"
+SHIPPED = Path(__file__).resolve().parents[3] / "configs" / "train"
 
 
 @pytest.mark.parametrize("name", train_config_names())

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import random
+import time
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,7 @@ from policy_pkg.episode import Episode
 from policy_pkg.live_weights import LiveAgent, Weights
 from policy_pkg.train.config import TrainConfig, graph_seed
 from policy_pkg.train.live.order import Lockstep, Task
+from policy_pkg.train.live.run import LiveRun
 from policy_pkg.train.live.session import LiveSession
 from policy_pkg.train.metrics import Value
 from sim_pkg.env import Env, make_env
@@ -174,3 +177,37 @@ class InProcess:
                 self.session.advance()
             if self.session.block_due:
                 self.end_block()
+
+
+class StoppedError(Exception):
+    """The trainer's process dies here."""
+
+
+def wait(run: LiveRun) -> None:
+    deadline = time.monotonic() + 60
+    while not run.done:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def live(
+    config: TrainConfig, out: Path, resume: bool, die_after_blocks: int = 1000
+) -> list[dict[str, Value]]:
+    """A run on one graph, whose sim goes on where the checkpoint says."""
+    blocks: list[dict[str, Value]] = []
+
+    def on_block(number: int, line: dict[str, Value]) -> None:
+        blocks.append(line)
+        if len(blocks) == die_after_blocks:
+            raise StoppedError
+
+    def on_tasks(tasks: list[Task]) -> None:
+        for task in tasks:
+            run.session.played(task, player.play(task))
+
+    run = LiveRun(config, SPEC, out, resume, "lockstep", on_tasks, on_block, print)
+    with run:
+        player = Player(config, first_episode=run.session.next_episodes[0])
+        run.start()
+        wait(run)
+    return blocks

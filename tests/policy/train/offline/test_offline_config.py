@@ -12,7 +12,7 @@ from policy_pkg.train.config import load_train_config, train_config_names
 from policy_pkg.train.offline.config import OfflineConfig, load_offline_config, offline_config_names
 from sim_pkg.env import make_env
 
-SHIPPED = Path(__file__).parents[2] / "configs" / "train"
+SHIPPED = Path(__file__).resolve().parents[4] / "configs" / "train"
 
 
 @pytest.mark.parametrize("name", offline_config_names())

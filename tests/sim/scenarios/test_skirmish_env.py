@@ -181,12 +181,12 @@ def test_same_bits_for_1_8_and_64_arenas() -> None:
 
 def test_same_bits_in_another_process() -> None:
     code = (
-        "import test_skirmish_env; "
-        "from sim_pkg.trajectory import combine; "
+        "import sys; sys.path += ['tests/support', 'tests/sim/scenarios']; "
+        "import test_skirmish_env; from sim_pkg.trajectory import combine; "
         "print(combine(test_skirmish_env.hashes('3s_vs_5z', 4, 8)))"
     )
     other = subprocess.run(
-        [sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, text=True,
+        [sys.executable, "-c", code], capture_output=True, text=True,
         check=True, timeout=60,
     )  # fmt: skip
     assert other.stdout.strip() == combine(hashes("3s_vs_5z", 8, 8))

@@ -6,7 +6,7 @@ import pytest
 import rclpy
 from sim_driver import Env, end_of, sim
 
-from crash_coach_common.strict_yaml import ConfigError
+from crash_coach_common.contract import UserError
 from sim_pkg.ros.sim_node import SimNode
 
 
@@ -15,7 +15,7 @@ def test_a_bad_start_is_one_line_and_exit_code_1(ros_env: Env) -> None:
         code, errors = end_of(process)
     assert code == 1
     assert errors.startswith(
-        "sim: error: unknown parameter 'senario' (did you mean 'scenario'?); known: scenario, mode"
+        "sim: error: unknown parameter 'senario' (did you mean 'scenario'?) of sim; known: "
     )
     assert errors.count("\n") == 1
 
@@ -36,7 +36,7 @@ def test_a_bad_start_is_one_line_and_exit_code_1(ros_env: Env) -> None:
 def test_bad_parameters(ros_env: Env, parameters: str, message: str) -> None:
     rclpy.init(args=["--ros-args", "-p", parameters])
     try:
-        with pytest.raises(ConfigError, match=message):
+        with pytest.raises(UserError, match=message):
             SimNode()
     finally:
         rclpy.shutdown()

@@ -24,10 +24,10 @@ from sweep_cases import (
 from policy_pkg.checkpoint import CHECKPOINTS, find_checkpoint, load_policy
 from policy_pkg.report.finished_runs import read_runs
 from policy_pkg.sweep.config import SweepRun
-from policy_pkg.sweep.folder import RunFiles, exclusive, newest_step
+from policy_pkg.sweep.folder import RunFiles, exclusive
 from policy_pkg.sweep.local_engine import LocalEngine
 from policy_pkg.sweep.sweep import Sweep
-from policy_pkg.train.run_dir import read_run
+from policy_pkg.train.run_dir import newest_step, read_run
 
 COMMAND = [sys.executable, "-m", "crash_coach_bringup.cli.main", "sweep"]
 

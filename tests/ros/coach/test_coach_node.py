@@ -202,7 +202,10 @@ def test_a_coach_that_starts_in_mid_episode_plans_it(ros_env: dict[str, str]) ->
     ("parameters", "message"),
     [
         ({}, "parameter 'robots' of coach is missing"),
-        ({"robots": ROBOTS, "crash_rte": 0.1}, "unknown parameter 'crash_rte' of coach; known: "),
+        (
+            {"robots": ROBOTS, "crash_rte": 0.1},
+            "unknown parameter 'crash_rte' (did you mean 'crash_rate'?) of coach; known: ",
+        ),
         ({"robots": ROBOTS, "crash_rate": 2.0}, "crash_rate"),
         ({"robots": ROBOTS, "victims": ("robot_7",)}, "unknown robot 'robot_7'"),
     ],

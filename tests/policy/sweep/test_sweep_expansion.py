@@ -180,7 +180,7 @@ def test_table1_is_the_papers() -> None:
 
 
 def test_the_example_in_the_documents_is_a_sweep(tmp_path: Path) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "sweeps.md").read_text()
+    page = (Path(__file__).resolve().parents[3] / "docs" / "sweeps.md").read_text()
     (example,) = re.findall(r"```yaml\n(.*?)```", page, flags=re.DOTALL)
     (tmp_path / "mine.yaml").write_text(example)
     runs = load_sweep(tmp_path / "mine.yaml")

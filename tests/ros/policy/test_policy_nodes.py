@@ -203,7 +203,11 @@ def test_an_observation_of_another_size_ends_the_policy(
     ("executable", "parameters", "message"),
     [
         ("team", {}, "'checkpoint' of team is missing"),
-        ("team", {"checkpiont": "x"}, "unknown parameter 'checkpiont' of team; known: checkpoint"),
+        (
+            "team",
+            {"checkpiont": "x"},
+            "unknown parameter 'checkpiont' (did you mean 'checkpoint'?) of team; known: ",
+        ),
         ("team", {"checkpoint": "/no/where"}, "/no/where: no such file or directory"),
         ("team", {"checkpoint": 3}, "checkpoint"),
         ("team", {"checkpoint": "HERE", "epsilon": 1.5}, "parameter epsilon = 1.5: Input should"),

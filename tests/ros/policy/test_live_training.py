@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from crash_coach_interfaces.msg import EpisodeState
+from live_player import InProcess, small
 from rclpy.qos import QoSProfile
 
 from crash_coach_bringup.ros.client import GraphClient, graph_client
@@ -29,9 +30,6 @@ from crash_coach_bringup.ros.live import LiveOptions, graph_options, run_live, t
 from crash_coach_bringup.ros.supervisor import Event, Supervisor
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.train.config import load_train_config
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "policy"))
-from live_player import InProcess, small
 
 WAIT_S = 90.0
 

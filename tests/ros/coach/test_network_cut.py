@@ -34,7 +34,7 @@ def refuse_without_namespaces() -> None:
 def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     refuse_without_namespaces()
     folder = tmp_path_factory.mktemp("network")
-    script = str(Path(__file__).with_name("network_cut.py"))
+    script = str(Path(__file__).parents[2] / "support" / "network_cut.py")
     # --kill-child, and what dies with its parent: nothing is left, even where this is killed.
     done = subprocess.run(
         [*UNSHARE, "--fork", "--kill-child", sys.executable, script, str(folder)],

@@ -71,7 +71,7 @@ class Fleet:
 
 @contextmanager
 def rover(env: dict[str, str], name: str) -> Iterator[None]:
-    script = str(Path(__file__).with_name("fleet.py"))
+    script = str(Path(__file__).parents[2] / "support" / "fleet.py")
     child = subprocess.Popen([sys.executable, script, name], env=env, start_new_session=True)
     try:
         yield

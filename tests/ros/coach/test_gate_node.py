@@ -128,7 +128,7 @@ def test_signals_end_it_cleanly(ros_env: dict[str, str], name: str, number: int)
         ({"robots": ("robot 1",)}, "robot name 'robot 1' is not a valid ROS name"),
         (
             {"robots": ("a",), "lockstp": True},
-            "unknown parameter 'lockstp' of gate; known: cmd_timeout_s",
+            "unknown parameter 'lockstp' (did you mean 'lockstep'?) of gate; known: cmd_timeout_s",
         ),
         ({"robots": ("a",), "first_lease_s": -1.0}, "first_lease_s"),
     ],

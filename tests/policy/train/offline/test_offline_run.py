@@ -16,6 +16,7 @@ from offline_recordings import (
     recording,
     with_crashes,
 )
+from offline_runs import SMALL, small, train_offline
 
 from crash_coach_common.contract import UserError
 from policy_pkg.checkpoint import CheckpointError, find_checkpoint, load_policy, read_manifest
@@ -24,35 +25,14 @@ from policy_pkg.learner.learner import Learner
 from policy_pkg.play.conditions import crash_free
 from policy_pkg.play.evaluate import evaluate
 from policy_pkg.statistics import binomial_weights
-from policy_pkg.train.offline import run as offline
 from policy_pkg.train.offline.config import OfflineConfig
 from policy_pkg.train.offline.data import load_data
-from policy_pkg.train.offline.run import read_data
 from policy_pkg.train.offline.session import MEANS, OfflineSession
-from policy_pkg.train.run import ProgressReport, RunSummary, TrainError
+from policy_pkg.train.run import ProgressReport, TrainError
 from policy_pkg.train.run_dir import RunError
 
-SMALL: dict[str, Any] = {
-    "scenario": "buttons",
-    "gradient_steps": 50,
-    "batch_episodes": 8,
-    "test_interval_steps": 10,
-    "test_episodes": 4,
-    "checkpoint_interval_steps": 20,
-    "tensorboard": False,
-    "learner": {
-        "hidden": 16,
-        "mixing_hidden": 8,
-        "hypernet_hidden": 8,
-        "target_update_interval_episodes": 15,
-    },
-}
-DOCUMENT = Path(__file__).parents[2] / "docs" / "algorithms.md"
+DOCUMENT = Path(__file__).resolve().parents[4] / "docs" / "algorithms.md"
 CONSERVATIVE = {**SMALL["learner"], "conservative_weight": 1.0}
-
-
-def small(**changes: Any) -> OfflineConfig:
-    return OfflineConfig.model_validate({**SMALL, **changes})
 
 
 METHODS = {
@@ -67,12 +47,6 @@ METHODS = {
 @pytest.fixture(scope="module")
 def recordings() -> list[Recording]:
     return buttons_recordings(40)
-
-
-def train_offline(
-    config: OfflineConfig, recordings: list[Recording], run: Path, **rest: Any
-) -> RunSummary:
-    return offline.train_offline(config, read_data(config, recordings), run, **rest)
 
 
 def lines(run: Path) -> list[dict[str, Any]]:
