@@ -9,7 +9,6 @@ from collections.abc import Callable
 from crash_coach_interfaces.msg import BlockResult, EpisodeState, FaultEvent
 from crash_coach_interfaces.msg import CrashPlan as CrashPlanMessage
 from rclpy.clock import Clock, ClockType
-from rclpy.context import Context
 from rclpy.node import Node
 
 from crash_coach_common.contract import UserError
@@ -26,36 +25,41 @@ from crash_coach_pkg.ros.convert import (
 
 ARM_TIMEOUT_S = 2.0
 HEARTBEATS_PER_LEASE = 3
-IN_FORCE = "/coach/plan_in_force"
 # How long the first plan waits for a gate to be discovered and to say what is in force. A gate
 # always says something, so that only a coach without one waits for so long.
 ADOPT_TIMEOUT_S = 5.0
 ENDLESS = Played(episode=0, ended=False, success=False)
 
 
+NAME = "_coach_link"  # a name that begins so is hidden from `ros2 node list` and `ros2 param list`
+
+
 class CoachLink(Node):
     """``changed`` guards ``control`` and what the gate answered.
 
     Args:
+        coach: the node that this is a part of: its clock and its log, under its name.
         follow_sim: follow the sim's episodes; otherwise episode 0 starts at once and never ends.
         check: called often; what it raises ends this node's thread.
     """
 
     def __init__(
         self,
+        coach: Node,
         control: Control,
         robots: tuple[str, ...],
         follow_sim: bool,
         check: Callable[[], None],
-        context: Context | None = None,
     ) -> None:
         super().__init__(
-            "coach_link",
-            context=context,
-            use_global_arguments=False,
+            NAME,
+            context=coach.context,
+            # Namespace and remapping of the process count; a new name for /coach does not.
+            cli_args=["--ros-args", "-r", f"__node:={NAME}"],
             start_parameter_services=False,
             enable_rosout=False,
         )
+        self._coach = coach
         self.control = control
         self.changed = threading.Condition()
         self._robots = robots
@@ -68,14 +72,16 @@ class CoachLink(Node):
         self._told = False  # whether the gate has told it
         self._left: CrashPlan | None = None
         self._waiting: list[Played] = [] if follow_sim else [ENDLESS]
-        self._plans = self.create_publisher(CrashPlanMessage, "/coach/plan", PLAN)
-        self.create_subscription(CrashPlanMessage, IN_FORCE, self._on_plan_in_force, PLAN)
+        self._plans = self.create_publisher(CrashPlanMessage, "coach/plan", PLAN)
+        self.create_subscription(
+            CrashPlanMessage, "coach/plan_in_force", self._on_plan_in_force, PLAN
+        )
         if follow_sim:
             self.create_subscription(
-                EpisodeState, "/sim/boundary", self._on_episode, EPISODE, raw=True
+                EpisodeState, "sim/boundary", self._on_episode, EPISODE, raw=True
             )
-        self.create_subscription(FaultEvent, "/coach/events", self._on_event, EVENTS)
-        self.create_subscription(BlockResult, "/trainer/blocks", self._on_block, BLOCKS)
+        self.create_subscription(FaultEvent, "coach/events", self._on_event, EVENTS)
+        self.create_subscription(BlockResult, "trainer/blocks", self._on_block, BLOCKS)
         self.create_timer(TICK_S, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def publish(self, plan: CrashPlan | None) -> None:
@@ -84,7 +90,7 @@ class CoachLink(Node):
             return
         lease_s = self.control.settings.lease_s
         self._due_s = time.monotonic() + lease_s / HEARTBEATS_PER_LEASE - TICK_S
-        stamp = self.get_clock().now().to_msg()
+        stamp = self._coach.get_clock().now().to_msg()
         self._plans.publish(message_from_plan(plan, self._robots, lease_s, stamp))
 
     def await_gate(self, plan: CrashPlan) -> str:
@@ -123,13 +129,13 @@ class CoachLink(Node):
         self.publish(self.control.follow(played.episode))
         record = self.control.finish(played.success) if played.ended else None
         if record is not None:
-            self.get_logger().info(f"block: {record}")
+            self._coach.get_logger().info(f"block: {record}")
 
     def _on_episode(self, data: bytes) -> None:
         try:
             played = played_from_bytes(data)
         except UserError as error:
-            self.get_logger().error(f"{error}; ignored")
+            self._coach.get_logger().error(f"{error}; ignored")
             return
         with self.changed:
             if self._settled:
@@ -143,10 +149,10 @@ class CoachLink(Node):
             try:
                 record = self.control.evaluated(message.success_rate)
             except UserError as error:
-                self.get_logger().error(f"{error}; ignored")
+                self._coach.get_logger().error(f"{error}; ignored")
                 return
         if record is not None:
-            self.get_logger().info(f"block {message.block} of the trainer: {record}")
+            self._coach.get_logger().info(f"block {message.block} of the trainer: {record}")
 
     def _on_plan_in_force(self, message: CrashPlanMessage) -> None:
         with self.changed:
@@ -161,7 +167,7 @@ class CoachLink(Node):
         try:
             return plan_from_message(message, self._robots)
         except UserError as error:
-            self.get_logger().error(f"plan in force {message.revision}: {error}; ignored")
+            self._coach.get_logger().error(f"plan in force {message.revision}: {error}; ignored")
             return None
 
     def _on_event(self, message: FaultEvent) -> None:
@@ -177,7 +183,7 @@ class CoachLink(Node):
                 self.changed.notify_all()
             elif message.kind == FaultEvent.REFUSED:
                 self._refused[message.revision] = message.detail
-                self.get_logger().error(f"the gate refused a plan: {message.detail}")
+                self._coach.get_logger().error(f"the gate refused a plan: {message.detail}")
                 self.changed.notify_all()
 
     def _on_tick(self) -> None:

@@ -1,8 +1,8 @@
 """Executable ``coach``: the control plane. Decides who crashes, when and how.
 
-Two nodes in one process: ``/coach`` with the parameters and services, served by a thread of its
-own, because a change with ``apply_at: next_step`` waits there for the gate's answer; and
-``/coach_link`` with the topics, which must go on meanwhile.
+Two nodes in one process: ``coach`` with the parameters and services, served by a thread of its
+own, because a change with ``apply_at: next_step`` waits there for the gate's answer; and the hidden
+``_coach_link`` with the topics, which must go on meanwhile.
 """
 
 from __future__ import annotations
@@ -75,12 +75,12 @@ class CoachNode(Node):
         # Seconds grow over restarts, so that a new coach's first plan is newer than the last one
         # of the coach before it.
         control = Control(settings, self._team, int(time.time()), planner)
-        self.link = CoachLink(control, robots, not self._endless, self._check_thread, context)
+        self.link = CoachLink(self, control, robots, not self._endless, self._check_thread)
         self._stop = threading.Event()
         self._threads = ThreadPoolExecutor(1, thread_name_prefix="coach parameters")
         self._served: Future[None] | None = None
         self.add_on_set_parameters_callback(self._on_set)
-        self.create_service(Trigger, "/coach/clear_all", self._on_clear_all)
+        self.create_service(Trigger, "coach/clear_all", self._on_clear_all)
 
     def _declare(self, specs: Sequence[ParameterSpec]) -> dict[str, Value]:
         return {

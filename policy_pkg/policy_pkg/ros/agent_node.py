@@ -59,12 +59,12 @@ class AgentNode(Node):
         observation_topic, command_topic = self._topics
         self._receive = receive
         self._commands = [
-            self.create_publisher(Action, f"/{name}/{command_topic}", NEWEST) for name in robots
+            self.create_publisher(Action, f"{name}/{command_topic}", NEWEST) for name in robots
         ]
         for index, name in enumerate(robots):
             self.create_subscription(
                 Observation,
-                f"/{name}/{observation_topic}",
+                f"{name}/{observation_topic}",
                 partial(self._on_observation, index),
                 NEWEST,
                 raw=True,

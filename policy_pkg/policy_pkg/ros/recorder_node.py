@@ -68,7 +68,8 @@ class RecorderNode(Node):
         for index, connection in enumerate(self._connections):
             self.create_subscription(
                 _CLASSES[connection.msgtype.rpartition("/")[2]],
-                connection.topic,
+                # Under the node's namespace; the recording has the plain name.
+                connection.topic.removeprefix("/"),
                 partial(self._recorder.put, index),
                 _qos(connection),
                 raw=True,

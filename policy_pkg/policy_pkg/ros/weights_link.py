@@ -12,8 +12,8 @@ from crash_coach_common.contract import UserError
 from policy_pkg.agent import Answer, Sensed
 from policy_pkg.live_weights import LiveAgent, Weights
 
-WEIGHTS_TOPIC = "/trainer/weights"
-STATUS_TOPIC = "/trainer/policies"
+WEIGHTS_TOPIC = "trainer/weights"
+STATUS_TOPIC = "trainer/policies"
 WEIGHTS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 STATUS = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 Receive = Callable[[int, Sensed[bytes]], list[Answer[bytes]]]

@@ -16,8 +16,8 @@ from sim_pkg.env import Env
 from sim_pkg.render.frames import actors, vitals, walled_m
 from sim_pkg.session import Session
 
-ARENA_TOPIC = "/sim/arena"
-ARENA_STATE_TOPIC = "/sim/arena_state"
+ARENA_TOPIC = "sim/arena"
+ARENA_STATE_TOPIC = "sim/arena_state"
 
 
 def arena_message(env: Env, lockstep: bool, header: Header) -> Arena:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from enum import Enum
 
-import rclpy
 from crash_coach_interfaces.msg import FaultEvent
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -41,11 +41,15 @@ class SimNode(Node):
 
     Raises:
         ConfigError: a parameter or the scenario is wrong.
+        SecondSimError: another sim runs on the domain, in the same namespace.
     """
 
     def __init__(self) -> None:
         super().__init__("sim", start_parameter_services=False)
         self.failure: str | None = None
+        self._alone = ExitStack()
+        domain = self.context.get_domain_id()
+        self._alone.enter_context(only_sim(domain, self.get_namespace()))
         self._params = params = read_parameters(self)
         self._env = env = make_env(params.scenario, 1)
         self._session = Session(env, params.seed, params.first_episode)
@@ -60,9 +64,9 @@ class SimNode(Node):
         self._topics = SimTopics(
             self, arena, env.spec, params.seed, self._on_command, self._on_event
         )
-        self.create_service(Trigger, "/sim/reset", self._on_reset)
-        self.create_service(Trigger, "/sim/step", self._on_step)
-        self.create_service(SetBool, "/sim/pause", self._on_pause)
+        self.create_service(Trigger, "sim/reset", self._on_reset)
+        self.create_service(Trigger, "sim/step", self._on_step)
+        self.create_service(SetBool, "sim/pause", self._on_pause)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._born_s = self._sent_s = time.monotonic()
         self._match_timer = self._every(_POLL_S, self._poll_match)
@@ -76,6 +80,10 @@ class SimNode(Node):
     def done(self) -> bool:
         """The wanted number of episodes has ended, or something failed."""
         return self._phase is _Phase.DONE or self.failure is not None
+
+    def destroy_node(self) -> None:
+        super().destroy_node()
+        self._alone.close()
 
     def finish(self) -> None:
         """Leaves no reader without the last episode state."""
@@ -255,7 +263,7 @@ class SimNode(Node):
 
 def _run(received: list[int]) -> None:
     """Serves a sim until it is done or stopped. Raises UserError saying why it failed."""
-    with only_sim(rclpy.get_default_context().get_domain_id()), serving() as served:
+    with serving() as served:
         node = served.add(SimNode())
         served.until(lambda: received or node.done)
         node.finish()

@@ -22,10 +22,10 @@ from sim_pkg.ros import convert
 from sim_pkg.ros.arena_view import ArenaView
 from sim_pkg.session import Session
 
-EPISODE_TOPIC = "/sim/episode"
+EPISODE_TOPIC = "sim/episode"
 # The same, only where an episode begins or ends: the coach need not wake at every step.
-BOUNDARY_TOPIC = "/sim/boundary"
-EVENTS_TOPIC = "/coach/events"
+BOUNDARY_TOPIC = "sim/boundary"
+EVENTS_TOPIC = "coach/events"
 _ACK_TIMEOUT_S = 2.0
 
 
@@ -62,14 +62,14 @@ class SimTopics:
         pub = node.create_publisher
         self._episode_pub = pub(EpisodeState, EPISODE_TOPIC, latched)
         self._boundary_pub = pub(EpisodeState, BOUNDARY_TOPIC, latched)
-        self._clock_pub = pub(Clock, "/clock", _reliable(10))
-        self._markers_pub = pub(MarkerArray, "/sim/markers", _reliable(10))
-        self._diagnostics_pub = pub(DiagnosticArray, "/diagnostics", _reliable(10))
-        self._obs_pubs = [pub(Observation, f"/{r}/observation", _reliable(1)) for r in spec.robots]
-        self._odom_pubs = [pub(Odometry, f"/{r}/odom", _reliable(10)) for r in spec.robots]
+        self._clock_pub = pub(Clock, "clock", _reliable(10))
+        self._markers_pub = pub(MarkerArray, "sim/markers", _reliable(10))
+        self._diagnostics_pub = pub(DiagnosticArray, "diagnostics", _reliable(10))
+        self._obs_pubs = [pub(Observation, f"{r}/observation", _reliable(1)) for r in spec.robots]
+        self._odom_pubs = [pub(Odometry, f"{r}/odom", _reliable(10)) for r in spec.robots]
         self._command_subs = [
             node.create_subscription(
-                Action, f"/{robot}/command", partial(on_command, i), _reliable(1), raw=True
+                Action, f"{robot}/command", partial(on_command, i), _reliable(1), raw=True
             )
             for i, robot in enumerate(spec.robots)
         ]
@@ -88,13 +88,11 @@ class SimTopics:
     def unmatched(self) -> list[str]:
         """Topics that nobody listens on (observations) or publishes (commands)."""
         missing = []
-        for robot, pub, sub in zip(
-            self._spec.robots, self._obs_pubs, self._command_subs, strict=True
-        ):
+        for pub, sub in zip(self._obs_pubs, self._command_subs, strict=True):
             if pub.get_subscription_count() == 0:
-                missing.append(f"/{robot}/observation has no subscriber")
+                missing.append(f"{pub.topic_name} has no subscriber")
             if sub.get_publisher_count() == 0:
-                missing.append(f"/{robot}/command has no publisher")
+                missing.append(f"{sub.topic_name} has no publisher")
         return missing
 
     def publish_step(self, session: Session) -> None:

@@ -111,10 +111,13 @@ def test_every_launch_argument_reaches_the_graph(checkpoint: Path) -> None:
             "layout": "team",
             "seed": "7",
             "episodes": "3",
+            "namespace": "fleet_a",
             "rviz": "false",
         }
     )
-    assert options == UpOptions("buttons", checkpoint, "lockstep", "team", seed=7, episodes=3)
+    assert options == UpOptions(
+        "buttons", checkpoint, "lockstep", "team", seed=7, episodes=3, namespace="fleet_a"
+    )
     parameters = {
         node.name: node.parameters for node in graph_nodes(options, TeamSpec(("robot_1",)))
     }

@@ -149,3 +149,28 @@ def test_auto_takes_the_type_that_is_published(ros_env: dict[str, str]) -> None:
         lane.got.clear()
         lane.passes()
         assert lane.got[-1].twist.linear.x == 0.0
+
+
+def test_a_rule_for_the_plan_moves_both_its_ends(ros_env: dict[str, str]) -> None:
+    rules = ("/coach/plan:=/x/plan",)
+    parameters = {"robots": ("a",), "dt_s": 0.05}
+    with (
+        process(ros_env, "gate", rules=rules, command_type=TWIST, **parameters),
+        process(ros_env, "coach", rules=rules, follow_sim=False, **parameters),
+        operator(ros_env) as setter,
+        graph_client("looker", int(ros_env["ROS_DOMAIN_ID"])) as client,
+    ):
+        assert not setter.set(victims=["a"], crash_mode="mute")  # the gate has armed it
+        node = client.node
+        assert node.count_publishers("/x/plan") == node.count_subscribers("/x/plan") == 1
+        assert node.count_publishers("/coach/plan") == node.count_subscribers("/coach/plan") == 0
+
+
+def test_another_name_for_the_coach_leaves_one_visible_node(ros_env: dict[str, str]) -> None:
+    with (
+        process(ros_env, "coach", rules=("__node:=boss", "__ns:=/hq"), robots=("a",)),
+        graph_client("looker", int(ros_env["ROS_DOMAIN_ID"])) as client,
+    ):
+        client.greet("/hq/boss", WAIT_S, "the coach")
+        names = set(client.node.get_node_names_and_namespaces()) - {("looker", "/")}
+        assert names == {("boss", "/hq"), ("_coach_link", "/hq")}

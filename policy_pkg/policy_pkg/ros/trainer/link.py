@@ -67,11 +67,11 @@ class GraphLink:
         self.lost = 0
         """Episodes that could not be used."""
         self._context = Context()
-        self._context.init(args=[], domain_id=graph.domain)
+        # The process's own arguments: namespace and remapping count on every domain.
+        self._context.init(domain_id=graph.domain)
         self._node = Node(
             "trainer",
             context=self._context,
-            use_global_arguments=False,
             start_parameter_services=False,
         )
         self._inbox = Inbox(
@@ -117,9 +117,9 @@ class GraphLink:
             UserError: something did not answer in time, or cannot be.
         """
         try:
-            self._greet("/sim")
-            if "gate" in self._node.get_node_names():
-                self._greet("/gate")
+            self._greet("sim")
+            if ("gate", self._node.get_namespace()) in self._node.get_node_names_and_namespaces():
+                self._greet("gate")
             self._guarded(self._ready)
             while not self._stopped():
                 self._executor.spin_once(timeout_sec=self.spin_s)

@@ -36,7 +36,7 @@ class LockstepLink(GraphLink):
         self._next = 0
         self._greeted = False
         self._deadline_s = time.monotonic() + START_S
-        self._reset = self._node.create_client(Trigger, "/sim/reset")
+        self._reset = self._node.create_client(Trigger, "sim/reset")
 
     def _take(self, task: Task) -> None:
         self._tasks.append(task)

@@ -33,7 +33,7 @@ from policy_pkg.ros.convert import fault_from_bytes, sensed_from_bytes
 from policy_pkg.ros.weights_link import STATUS, STATUS_TOPIC, WEIGHTS, WEIGHTS_TOPIC
 from policy_pkg.train.live.inbox import Inbox
 
-BLOCKS_TOPIC = "/trainer/blocks"
+BLOCKS_TOPIC = "trainer/blocks"
 # A sim in lock-step does not wait for this process, whose threads share one interpreter.
 DEEP = QoSProfile(depth=2000)
 DEEP_LATCHED = QoSProfile(depth=2000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -88,7 +88,7 @@ class TrainerTopics:
             for kind, message in kinds.items():
                 subscription = node.create_subscription(
                     message,
-                    f"/{robot}/{kind.value}",
+                    f"{robot}/{kind.value}",
                     partial(self._on_robot, kind, index),
                     DEEP,
                     raw=True,
@@ -96,22 +96,21 @@ class TrainerTopics:
                 if kind is Kind.COMMAND:
                     self._commands.append(subscription)
         node.create_subscription(
-            EpisodeState, "/sim/episode", self._on_state, DEEP_LATCHED, raw=True
+            EpisodeState, "sim/episode", self._on_state, DEEP_LATCHED, raw=True
         )
-        node.create_subscription(CrashPlan, "/coach/plan", self._on_plan, DEEP_LATCHED)
-        node.create_subscription(FaultEvent, "/coach/events", self._on_event, DEEP)
+        node.create_subscription(CrashPlan, "coach/plan", self._on_plan, DEEP_LATCHED)
+        node.create_subscription(FaultEvent, "coach/events", self._on_event, DEEP)
         node.create_subscription(PolicyStatus, STATUS_TOPIC, heard.status, STATUS)
 
     def missing(self, coached: bool) -> list[str]:
         """Robots without anybody who commands them; with ``coached``, a coach that hears blocks."""
-        robots = zip(self._spec.robots, self._commands, strict=True)
         missing = [
-            f"/{robot}/command has no publisher"
-            for robot, subscription in robots
+            f"{subscription.topic_name} has no publisher"
+            for subscription in self._commands
             if subscription.get_publisher_count() == 0
         ]
         if coached and self._blocks.get_subscription_count() == 0:
-            missing.append(f"no coach listens to {BLOCKS_TOPIC}")
+            missing.append(f"no coach listens to {self._blocks.topic_name}")
         return missing
 
     def publish_weights(

@@ -47,6 +47,7 @@ def team(context: LaunchContext) -> list[Node]:
             package=node.package,
             executable=node.executable,
             name=node.name,
+            namespace=node.namespace,
             # Text stays text: launch would read a run directory named 1e3 as a number.
             parameters=[
                 {

@@ -24,6 +24,9 @@ ModeOption = Annotated[
         "any other mode of docs/faults.md."
     ),
 ]
+NamespaceOption = Annotated[
+    str, typer.Option(help="ROS namespace of the whole graph, so that several share a domain.")
+]
 ParamOption = Annotated[
     list[str] | None,
     typer.Option(help="NAME=VALUE ...: parameters of the mode, such as steps=3 of delay."),

@@ -13,6 +13,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 from crash_coach_bringup.ros.discovery import use_quick_discovery
+from crash_coach_bringup.ros.namespaces import checked_namespace
 from crash_coach_common.ros.greet import SPIN_S, WaitError, greet
 
 
@@ -64,14 +65,25 @@ class GraphClient:
 
 @contextmanager
 def graph_client(
-    name: str, domain: int | None = None, check: Callable[[], None] = lambda: None
+    name: str,
+    domain: int | None = None,
+    check: Callable[[], None] = lambda: None,
+    namespace: str = "",
 ) -> Iterator[GraphClient]:
-    """A client on ``domain`` (None: the environment's), independent of rclpy's global state."""
+    """A client on ``domain`` (None: the environment's), independent of rclpy's global state.
+
+    ``namespace``: that relative names of topics, services and nodes are in.
+    """
     use_quick_discovery()
     context = Context()
     context.init(args=[], domain_id=domain)
     try:
-        node = Node(name, context=context, use_global_arguments=False)
+        node = Node(
+            name,
+            context=context,
+            namespace=checked_namespace(namespace) or None,
+            use_global_arguments=False,
+        )
         client = GraphClient(node, context, check)
         try:
             yield client

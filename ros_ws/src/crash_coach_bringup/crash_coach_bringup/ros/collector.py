@@ -53,24 +53,24 @@ class Collector:
         self._faulted: set[tuple[int, int, str]] = set()  # (episode, step, robot) with an EFFECT
         self._refused = ""
         node = client.node
-        self._reset = node.create_client(Trigger, "/sim/reset")
+        self._reset = node.create_client(Trigger, "sim/reset")
         self._subscriptions = (
             node.create_subscription(
                 EpisodeState,
-                "/sim/episode",
+                "sim/episode",
                 self._on_state,
                 QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL),
             ),
             node.create_subscription(
-                FaultEvent, "/coach/events", self._on_event, QoSProfile(depth=1000)
+                FaultEvent, "coach/events", self._on_event, QoSProfile(depth=1000)
             ),
         )
-        client.greet("/sim", START_S, "the sim to start")
-        client.greet("/gate", START_S, "the gate to start")
+        client.greet("sim", START_S, "the sim to start")
+        client.greet("gate", START_S, "the gate to start")
         client.until(self._ready, START_S, "the sim to serve /sim/reset")
 
     def _ready(self) -> bool:
-        publishers: int = self._client.node.count_publishers("/sim/episode")
+        publishers: int = self._client.node.count_publishers("sim/episode")
         return publishers > 0 and self._reset.service_is_ready()
 
     def _on_state(self, message: EpisodeState) -> None:
@@ -118,7 +118,7 @@ class Collector:
     def effects(self) -> tuple[EffectRow, ...]:
         """Of all episodes that were played, sorted."""
         # The gate's answer comes behind the events that it has published.
-        self._client.greet("/gate", EVENTS_S, "the gate's last events")
+        self._client.greet("gate", EVENTS_S, "the gate's last events")
         return tuple(sorted(self._effects))
 
     def _start(self, episode: int) -> None:

@@ -60,9 +60,9 @@ class Episodes:
 
 
 @contextmanager
-def listening(domain: int) -> Iterator[Episodes]:
-    """On the graph of a domain."""
-    with graph_client("crash_coach_episodes", domain) as client:
+def listening(domain: int, namespace: str = "") -> Iterator[Episodes]:
+    """On the graph of a domain, in a namespace."""
+    with graph_client("crash_coach_episodes", domain, namespace=namespace) as client:
         yield Episodes(client)
 
 

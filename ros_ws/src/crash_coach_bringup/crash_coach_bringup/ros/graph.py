@@ -6,11 +6,12 @@ import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 from crash_coach_bringup.ros import discovery
+from crash_coach_bringup.ros.namespaces import checked_namespace
 from crash_coach_bringup.ros.probe import find_executable
 from crash_coach_common.contract import UserError
 from crash_coach_pkg.coach.config import CoachConfig, FaultConfig, TeamSpec
@@ -48,6 +49,7 @@ class UpOptions:
     coach and gate out: the policies command the robots directly. ``checkpoint`` None: a trainer
     gives the policies their weights, and the coach its success rates. ``epsilon``: with this
     probability, per robot and step, a policy takes a random action, keyed by ``seed``.
+    ``namespace``: every name of the graph is in it; empty: none.
     """
 
     scenario: str
@@ -64,21 +66,24 @@ class UpOptions:
     relay_observations: bool = False
     sim: Mapping[str, Value] = field(default_factory=dict)
     domain: int | None = None  # None: ROS_DOMAIN_ID, or 0
+    namespace: str = ""
     log_dir: Path = Path("runs/up")
 
 
 @dataclass(frozen=True)
 class Node:
-    """A ROS node: where it comes from, its name and its parameters."""
+    """A ROS node: where it comes from, its name and namespace ('': none) and its parameters."""
 
     name: str
     package: str
     executable: str
     parameters: Mapping[str, Value]
+    namespace: str = ""
 
     def arguments(self) -> list[str]:
         """--ros-args for a process that holds this node only."""
-        return ros_arguments(["-r", f"__node:={self.name}"], "", self.parameters)
+        start = ["-r", f"__node:={self.name}", *namespace_rule(self.namespace)]
+        return ros_arguments(start, "", self.parameters)
 
 
 @dataclass(frozen=True)
@@ -104,6 +109,10 @@ def domain_id(options: UpOptions) -> int:
 def graph_environment(domain: int) -> dict[str, str]:
     """What the processes' environment needs. Raises UserError as discovery.profiles_file."""
     return {"ROS_DOMAIN_ID": str(domain), discovery.VARIABLE: discovery.profiles_file()}
+
+
+def namespace_rule(namespace: str) -> list[str]:
+    return ["-r", f"__ns:={namespace}"] if namespace else []
 
 
 def ros_arguments(start: list[str], prefix: str, parameters: Mapping[str, Value]) -> list[str]:
@@ -176,7 +185,11 @@ def lost_after_s(options: UpOptions, dt_s: float) -> float:
 
 
 def graph_nodes(options: UpOptions, team: TeamSpec) -> list[Node]:
-    """The graph's nodes, the sim last: the others are ready to answer when it starts."""
+    """The graph's nodes, the sim last: the others are ready to answer when it starts.
+
+    Raises:
+        UserError: as relays_observations and checked_namespace.
+    """
     acting: dict[str, Value] = {"command_topic": "command_raw" if options.gate else "command"}
     if options.checkpoint is None:
         acting["live"] = True
@@ -214,7 +227,9 @@ def graph_nodes(options: UpOptions, team: TeamSpec) -> list[Node]:
         "autostart": options.autostart,
         **options.sim,
     }
-    return [*nodes, Node("sim", "sim_pkg", "sim", sim)]
+    namespace = checked_namespace(options.namespace)
+    nodes.append(Node("sim", "sim_pkg", "sim", sim))
+    return [replace(node, namespace=namespace) for node in nodes]
 
 
 def graph_processes(options: UpOptions, team: TeamSpec) -> list[Process]:
@@ -238,6 +253,7 @@ def single_process(nodes: Sequence[Node]) -> Process:
     """All nodes in one process: parameters carry their node's name."""
     arguments: list[str] = []
     for node in nodes:
-        arguments += ros_arguments([], f"{node.name}:", node.parameters)
+        start = namespace_rule(node.namespace)
+        arguments += ros_arguments(start, f"{node.name}:", node.parameters)
     module = "crash_coach_bringup.ros.single"
     return Process("graph", (sys.executable, "-m", module, *arguments))

@@ -11,11 +11,12 @@ from rclpy.parameter_client import AsyncParameterClient
 from std_srvs.srv import Trigger
 
 from crash_coach_bringup.ros.client import GraphClient, graph_client
+from crash_coach_bringup.ros.namespaces import checked_namespace
 from crash_coach_common.contract import UserError
 from crash_coach_pkg.coach.injection import describe, injection
 from crash_coach_pkg.faults import check_parameters
 
-COACH = "/coach"
+COACH = "coach"
 
 
 class InjectError(UserError):
@@ -46,6 +47,7 @@ def inject(
     timeout_s: float = 10.0,
     domain: int | None = None,
     parameters: Mapping[str, float] | None = None,
+    namespace: str = "",
 ) -> InjectResult:
     """Makes ``victims`` crash, all or none; returns once the gate has armed the fault.
 
@@ -58,6 +60,7 @@ def inject(
         timeout_s: longest wait for the coach to appear, and again for its answer.
         domain: ROS domain; None: the environment's.
         parameters: of the mode; what is missing has its default.
+        namespace: that the graph was started in.
 
     Raises:
         InjectError: the coach refused, with its reason.
@@ -70,10 +73,11 @@ def inject(
         Parameter(name, value=list(value) if isinstance(value, tuple) else value)
         for name, value in wanted.items()
     ]
-    with graph_client("crash_coach_inject", domain) as client:
+    no_coach = _no_coach(domain, namespace)
+    with graph_client("crash_coach_inject", domain, namespace=namespace) as client:
         setter = AsyncParameterClient(client.node, COACH)
-        client.greet(COACH, timeout_s, _no_coach(domain))
-        client.until(setter.services_are_ready, timeout_s, _no_coach(domain))
+        client.greet(COACH, timeout_s, no_coach)
+        client.until(setter.services_are_ready, timeout_s, no_coach)
         future = setter.set_parameters_atomically(settings)
         result = client.result(future, timeout_s, "the coach's answer").result
     if not result.successful:
@@ -82,21 +86,21 @@ def inject(
     return InjectResult(tuple(victims), mode, apply_at, start_step, duration_steps, known)
 
 
-def clear(timeout_s: float = 10.0, domain: int | None = None) -> str:
+def clear(timeout_s: float = 10.0, domain: int | None = None, namespace: str = "") -> str:
     """Ends every fault, from the next step on; returns the coach's answer.
 
     Raises:
         InjectError: the coach refused, with its reason.
         WaitError: no coach on this domain, or no answer.
     """
-    with graph_client("crash_coach_clear", domain) as client:
-        return _clear(client, timeout_s, domain)
+    with graph_client("crash_coach_clear", domain, namespace=namespace) as client:
+        return _clear(client, timeout_s, _no_coach(domain, namespace))
 
 
-def _clear(client: GraphClient, timeout_s: float, domain: int | None) -> str:
+def _clear(client: GraphClient, timeout_s: float, no_coach: str) -> str:
     service = client.node.create_client(Trigger, f"{COACH}/clear_all")
-    client.greet(COACH, timeout_s, _no_coach(domain))
-    client.until(service.service_is_ready, timeout_s, _no_coach(domain))
+    client.greet(COACH, timeout_s, no_coach)
+    client.until(service.service_is_ready, timeout_s, no_coach)
     future = service.call_async(Trigger.Request())
     answer = client.result(future, timeout_s, "the coach's answer")
     if not answer.success:
@@ -104,6 +108,7 @@ def _clear(client: GraphClient, timeout_s: float, domain: int | None) -> str:
     return str(answer.message)
 
 
-def _no_coach(domain: int | None) -> str:
+def _no_coach(domain: int | None, namespace: str) -> str:
     shown = os.environ.get("ROS_DOMAIN_ID", "0") if domain is None else domain
-    return f"a node {COACH} on ROS domain {shown}; start one with 'crash-coach up'"
+    name = f"{checked_namespace(namespace)}/{COACH}"
+    return f"a node {name} on ROS domain {shown}; start one with 'crash-coach up'"

@@ -30,6 +30,7 @@ ARGUMENTS = (
     LaunchArgument("layout", "A policy process per robot, or one for the team.", "nodes", LAYOUTS),
     LaunchArgument("seed", "Seed of episodes and crashes.", "0"),
     LaunchArgument("episodes", "End after this many episodes; 0: run on.", "0"),
+    LaunchArgument("namespace", "Of every name of the graph.", ""),
     LaunchArgument("rviz", "Also start RViz.", "false", ("true", "false")),
 )
 
@@ -43,6 +44,7 @@ def options_from(values: Mapping[str, str]) -> UpOptions:
         layout=cast(Layout, values["layout"]),
         seed=_count("seed", values["seed"]),
         episodes=_count("episodes", values["episodes"]),
+        namespace=values["namespace"],
     )
 
 

@@ -8,13 +8,10 @@ from __future__ import annotations
 
 import sys
 
-import rclpy
-
 from crash_coach_common.contract import UserError
 from crash_coach_common.ros.run_node import run, serving
 from crash_coach_pkg.ros import coach_node, gate_node
 from policy_pkg.ros.team_node import TeamNode
-from sim_pkg.ros.sim_lock import only_sim
 from sim_pkg.ros.sim_node import SimNode
 
 
@@ -24,7 +21,7 @@ def main() -> int:
 
 
 def _run(received: list[int]) -> None:
-    with only_sim(rclpy.get_default_context().get_domain_id()), serving() as served:
+    with serving() as served:
         served.start(gate_node.start)
         served.start(coach_node.start)
         team, sim = served.add(TeamNode()), served.add(SimNode())

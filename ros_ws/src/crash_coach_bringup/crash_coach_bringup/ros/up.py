@@ -18,6 +18,7 @@ from crash_coach_bringup.ros.graph import (
     graph_environment,
     graph_processes,
 )
+from crash_coach_bringup.ros.namespaces import checked_namespace
 from crash_coach_bringup.ros.supervisor import Event, Supervisor, watch
 from crash_coach_console.access import Access
 from crash_coach_console.episodes import Played
@@ -46,12 +47,12 @@ def run_up(
     domain = domain_id(options)
     processes = graph_processes(options, check_team(options))
     if console is not None:
-        processes.append(console_process(console))
-    refuse_second_sim(domain)
+        processes.append(console_process(console, options.namespace))
+    refuse_second_sim(domain, options.namespace)
     environment, lockstep = graph_environment(domain), options.mode == "lockstep"
     with (
         stop_signals() as interrupted,
-        listening(domain) as episodes,
+        listening(domain, options.namespace) as episodes,
         Supervisor(processes, options.log_dir, environment, throughput=lockstep) as running,
     ):
 
@@ -78,17 +79,19 @@ def run_up(
     return exit_code
 
 
-def console_process(port: int) -> Process:
-    """Raises UserError where the port is taken."""
+def console_process(port: int, namespace: str) -> Process:
+    """Of a graph in ``namespace``. Raises UserError where the port is taken."""
     check_address(Access().host, port)
-    arguments = ("-m", "crash_coach_console.command", "--port", str(port))
+    arguments = ["-m", "crash_coach_console.command", "--port", str(port)]
+    if namespace:
+        arguments += ["--namespace", checked_namespace(namespace)]
     return Process(CONSOLE, (sys.executable, *arguments))
 
 
-def refuse_second_sim(domain: int) -> None:
-    """Raises GraphError where a sim already runs on the domain."""
+def refuse_second_sim(domain: int, namespace: str) -> None:
+    """Raises GraphError where a sim already runs on the domain, in the namespace."""
     try:
-        with only_sim(domain):
+        with only_sim(domain, checked_namespace(namespace)):
             pass  # it is free: the graph's own sim takes it
     except SecondSimError as error:
         raise GraphError(str(error)) from None

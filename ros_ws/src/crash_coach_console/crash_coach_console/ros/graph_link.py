@@ -209,4 +209,4 @@ class GraphLink:
         sub(FaultEvent, "coach/events", hear.on_event, many)
         sub(CrashPlan, "coach/plan", hear.on_plan, LATCHED)
         sub(CrashPlan, "coach/plan_in_force", hear.on_plan_in_force, LATCHED)
-        sub(DiagnosticArray, "/diagnostics", hear.on_diagnostics, QoSProfile(depth=10))
+        sub(DiagnosticArray, "diagnostics", hear.on_diagnostics, QoSProfile(depth=10))

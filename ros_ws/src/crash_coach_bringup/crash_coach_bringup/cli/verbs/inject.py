@@ -9,7 +9,12 @@ from typing import Annotated
 
 import typer
 
-from crash_coach_bringup.cli.options import ModeOption, ParamOption, mode_parameters
+from crash_coach_bringup.cli.options import (
+    ModeOption,
+    NamespaceOption,
+    ParamOption,
+    mode_parameters,
+)
 from crash_coach_bringup.cli.output import CliError, check_json_target, console, written_first
 
 
@@ -40,6 +45,7 @@ def inject(
     timeout_s: Annotated[
         float, typer.Option(help="Longest wait for the coach, seconds.", min=0.1)
     ] = 10.0,
+    namespace: NamespaceOption = "",
     json: Annotated[Path | None, typer.Option(help="Also write the result to this file.")] = None,
 ) -> None:
     """Sets the coach's parameters, as `ros2 param set` would, and waits until they hold."""
@@ -52,12 +58,14 @@ def inject(
     from crash_coach_bringup.ros import inject as client
 
     if clear:
-        answer = client.clear(timeout_s)
+        answer = client.clear(timeout_s, namespace=namespace)
         with written_first(json, {"cleared": True, "answer": answer}):
             console.print(answer)
         return
     result = client.inject(
-        victims or [], mode, apply_at.value, duration_steps, start, timeout_s, parameters=parameters
+        *(victims or [], mode, apply_at.value, duration_steps, start, timeout_s),
+        parameters=parameters,
+        namespace=namespace,
     )
     with written_first(json, asdict(result)):
         console.print(str(result))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from crash_coach_bringup.cli.options import NamespaceOption
 from crash_coach_bringup.cli.output import CliError
 from crash_coach_bringup.cli.verbs.evaluate import Layout, LayoutOption
 from crash_coach_console.serve import PORT
@@ -65,6 +66,7 @@ def up(
     relay_observations: RelayOption = False,
     console: ConsoleOption = False,
     port: PortOption = PORT,
+    namespace: NamespaceOption = "",
     logs: Annotated[Path, typer.Option(help="Folder for the nodes' logs.")] = Path("runs/up"),
 ) -> None:
     """Starts sim, policies, gate and coach until the last episode, Ctrl-C, or a node's death.
@@ -88,5 +90,6 @@ def up(
         coach=at_rate(crash_rate).crash,
         relay_observations=relay_observations,
         log_dir=logs,
+        namespace=namespace,
     )
     raise typer.Exit(run_up(options, show, port if console else None))
