@@ -48,8 +48,10 @@ class Fleets:
 
     def crashed(self) -> set[tuple[int, ...]]:
         """In our fleet's next whole episode."""
-        self.client.pause(0.1)  # what waits to be read is older
-        wanted = self.states[-1].episode + 1
+        # The gate's answer comes behind its events; states that wait to be read may be older.
+        self.client.greet(f"{OURS}/gate", WAIT_S, "the gate's events")
+        armed = [e.episode for e in self.events[OURS] if e.kind == FaultEvent.ARMED]
+        wanted = max(armed[-1] if armed else 0, self.states[-1].episode) + 1
         self.client.until(
             lambda: self.states[-1].episode > wanted, WAIT_S, f"episode {wanted} to end"
         )
