@@ -80,6 +80,19 @@ def allowed(package: str, path: Path, name: str) -> bool:
     return package == "policy_pkg" and inside[0] in JOINING and top != "crash_coach_bringup"
 
 
+def test_verbs_do_not_import_verbs() -> None:
+    """What several need has a module of its own: options, playing, figure_style, output."""
+    cli = BRINGUP / "cli"
+    broken = [
+        f"{path.relative_to(ROOT)}:{line} imports {name}"
+        for path in sorted(cli.rglob("*.py"))
+        if path != cli / "main.py"
+        for name, line in imports(path)
+        if within(name, "crash_coach_bringup.cli.verbs")
+    ]
+    assert not broken, "\n".join(broken)
+
+
 def test_import_law() -> None:
     broken = [
         f"{path.relative_to(ROOT)}:{line} imports {name}"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from enum import IntEnum
+from typing import Any
 
 NEXT_STEP = 0xFFFFFFFF
 """A start step that the gate resolves to the first step it has not relayed anything of."""
@@ -87,3 +88,21 @@ class CrashPlan:
                 for f in self.faults
             ),
         )
+
+
+def plan_to_json(plan: CrashPlan) -> dict[str, Any]:
+    """What ``plan_from_json`` makes the same plan of."""
+    return asdict(plan)
+
+
+def plan_from_json(values: dict[str, Any]) -> CrashPlan:
+    """Raises KeyError, TypeError or ValueError where it is no plan."""
+    faults = tuple(_fault_from_json(fault) for fault in values["faults"])
+    return CrashPlan(**{**values, "faults": faults})
+
+
+def _fault_from_json(values: dict[str, Any]) -> Fault:
+    parameters = tuple((name, value) for name, value in values["parameters"])
+    kind, numbers = TriggerKind(values["trigger"]["kind"]), values["trigger"]["values"]
+    trigger = Trigger(kind, tuple(numbers))
+    return Fault(**{**values, "parameters": parameters, "trigger": trigger})

@@ -13,7 +13,7 @@ from typer.testing import CliRunner, Result
 from crash_coach_bringup.cli.faults.play import play
 from crash_coach_bringup.cli.faults.report import FILES
 from crash_coach_bringup.cli.faults.verb import app
-from crash_coach_bringup.cli.verbs.evaluate import Layout, Via
+from crash_coach_bringup.cli.options import Layout, Via
 from crash_coach_bringup.ros.probe import find_executable
 from crash_coach_common.contract import UserError
 from crash_coach_pkg.coach.config import TeamSpec

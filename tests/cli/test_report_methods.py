@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from report_cases import write_run
 
+from crash_coach_bringup.cli.figure_style import style
 from crash_coach_bringup.cli.report.curves import learning_curves
 from crash_coach_bringup.cli.report.figures import resilience
 from crash_coach_bringup.cli.report.verb import report
-from crash_coach_bringup.cli.verbs.plot import style
 from policy_pkg.play.conditions import exactly
 from policy_pkg.report.finished_runs import find_runs, method_name, read_runs
 from policy_pkg.report.kept_evaluations import Evaluations

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 from report_cases import results_of, write_run
 
+from crash_coach_bringup.cli.figure_style import FORMATS
 from crash_coach_bringup.cli.output import CliError
 from crash_coach_bringup.cli.report.verb import asked, report
-from crash_coach_bringup.cli.verbs.plot import FORMATS
 from crash_coach_common.contract import UserError
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.run_dir import RunError, prepare_run

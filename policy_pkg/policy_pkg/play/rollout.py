@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,11 @@ import numpy.typing as npt
 
 from crash_coach_common.contract import BatchEnv, FloatArray, IntArray, StepResult, UserError
 from crash_coach_pkg.faults.action_tools import UNTOLD
-from crash_coach_pkg.plan import CrashPlan, Fault, Trigger, TriggerKind
+from crash_coach_pkg.plan import (
+    CrashPlan,
+    plan_from_json,
+    plan_to_json,
+)
 from policy_pkg.act import Explorer
 from policy_pkg.checkpoint import CheckpointError
 from policy_pkg.episode import Episode
@@ -216,19 +220,3 @@ class Rollout:
                     f"scenario {self._env.spec.scenario!r} ends an episode earlier than it did "
                     "when this checkpoint was written"
                 )
-
-
-def plan_to_json(plan: CrashPlan) -> dict[str, Any]:
-    return asdict(plan)
-
-
-def plan_from_json(values: dict[str, Any]) -> CrashPlan:
-    faults = tuple(_fault_from_json(fault) for fault in values["faults"])
-    return CrashPlan(**{**values, "faults": faults})
-
-
-def _fault_from_json(values: dict[str, Any]) -> Fault:
-    parameters = tuple((name, value) for name, value in values["parameters"])
-    kind, numbers = TriggerKind(values["trigger"]["kind"]), values["trigger"]["values"]
-    trigger = Trigger(kind, tuple(numbers))
-    return Fault(**{**values, "parameters": parameters, "trigger": trigger})

@@ -14,13 +14,20 @@ from crash_coach_pkg.coach.coach import Coach
 from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
 from crash_coach_pkg.effects import OBSERVED, WITHHELD, EffectRow
 from crash_coach_pkg.faults import mode_names
-from crash_coach_pkg.plan import CrashPlan, Fault, Trigger, TriggerKind
+from crash_coach_pkg.plan import (
+    CrashPlan,
+    Fault,
+    Trigger,
+    TriggerKind,
+    plan_from_json,
+    plan_to_json,
+)
 from policy_pkg.episode import Sizes
 from policy_pkg.learner.config import LearnerConfig
 from policy_pkg.learner.learner import Learner
 from policy_pkg.play.conditions import Condition, Planned, crash_free, named
 from policy_pkg.play.evaluate import Evaluation, Scripted, evaluate
-from policy_pkg.play.rollout import Finished, Rollout, plan_from_json, plan_to_json
+from policy_pkg.play.rollout import Finished, Rollout
 from policy_pkg.policy import RecurrentPolicy
 from sim_pkg.env import make_env
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from crash_coach_bringup.cli.faults.play import play
-from crash_coach_bringup.cli.verbs.evaluate import Layout, Via
+from crash_coach_bringup.cli.options import Layout, Via
 from crash_coach_pkg.coach.fault_scenario import load_fault_scenario
 from policy_pkg.play.target import load_target
 from policy_pkg.untrained import write_untrained

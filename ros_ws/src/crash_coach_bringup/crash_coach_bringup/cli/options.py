@@ -1,9 +1,10 @@
-"""Options that say who crashes and how, and the conditions that they ask for."""
+"""Options that several verbs have: who crashes and how, and where it is played."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from enum import StrEnum
 from typing import Annotated
 
 import typer
@@ -31,6 +32,55 @@ ParamOption = Annotated[
     list[str] | None,
     typer.Option(help="NAME=VALUE ...: parameters of the mode, such as steps=3 of delay."),
 ]
+
+
+MOST_EPISODES = 1_000_000
+
+
+MOST_PROCESSES = 1024
+
+
+class Via(StrEnum):
+    core = "core"
+    ros = "ros"
+
+
+class Layout(StrEnum):
+    nodes = "nodes"
+    team = "team"
+    single = "single"
+
+
+ViaOption = Annotated[
+    Via,
+    typer.Option(help="Played here, or by a real ROS graph in lock-step, with the same results."),
+]
+
+
+LayoutOption = Annotated[
+    Layout,
+    typer.Option(help="With --via ros: a process per node, one for the team, or a single process."),
+]
+
+
+ProcessesOption = Annotated[
+    int,
+    typer.Option(
+        help="How many processes share the episodes; changes no result.",
+        min=1,
+        max=MOST_PROCESSES,
+    ),
+]
+
+
+EachRobotOption = Annotated[
+    bool, typer.Option("--each-robot", help="Each robot alone, in every episode: who hurts most.")
+]
+
+
+class Mode(StrEnum):
+    lockstep = "lockstep"
+    realtime = "realtime"
 
 
 def mode_parameters(mode: str, given: list[str]) -> dict[str, float]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from crash_coach_bringup.cli.verbs.plot import COLOURS, INK
+from crash_coach_bringup.cli.figure_style import COLOURS, INK
 from crash_coach_pkg.faults import is_observation_mode
 from policy_pkg.report.verdict import FaultRun
 from policy_pkg.statistics import wilson

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from crash_coach_bringup.cli.options import Layout, Via
 from crash_coach_bringup.cli.output import CliError
-from crash_coach_bringup.cli.verbs.evaluate import Layout, Via
 from crash_coach_common.contract import EnvSpec
 from crash_coach_common.strict_yaml import ConfigError
 from crash_coach_pkg.coach.config import TeamSpec

@@ -13,6 +13,7 @@ from rich.text import Text
 from crash_coach_bringup.cli.faults.docs import generated, update
 from crash_coach_bringup.cli.faults.play import check_scenario, play
 from crash_coach_bringup.cli.faults.report import Played, check_target, measured, write
+from crash_coach_bringup.cli.options import MOST_EPISODES, Layout, LayoutOption, Via, ViaOption
 from crash_coach_bringup.cli.output import (
     CliError,
     check_file_target,
@@ -21,13 +22,6 @@ from crash_coach_bringup.cli.output import (
     table,
     tell_note,
     write_file,
-)
-from crash_coach_bringup.cli.verbs.evaluate import (
-    MOST_EPISODES,
-    Layout,
-    LayoutOption,
-    Via,
-    ViaOption,
 )
 from crash_coach_pkg.coach.fault_scenario import (
     FaultScenario,

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 
+from crash_coach_bringup.cli.figure_style import INK, STEPS, style
 from crash_coach_bringup.cli.report.panels import legend_above, panels
-from crash_coach_bringup.cli.verbs.plot import INK, STEPS, style
 from policy_pkg.report.finished_runs import Run, read_lines
 from policy_pkg.train.run_dir import METRICS
 

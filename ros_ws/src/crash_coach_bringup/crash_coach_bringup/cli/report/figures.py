@@ -9,6 +9,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from crash_coach_bringup.cli.figure_style import COLOURS, FORMATS, INK, save, style
 from crash_coach_bringup.cli.output import CliError
 from crash_coach_bringup.cli.picture import TeamResults, draw_first_episodes
 from crash_coach_bringup.cli.report.curves import learning_curves
@@ -16,7 +17,6 @@ from crash_coach_bringup.cli.report.findings import Findings
 from crash_coach_bringup.cli.report.panels import COLUMNS, legend_above, panels
 from crash_coach_bringup.cli.report.success import in_recordings, success
 from crash_coach_bringup.cli.report.victims import victims
-from crash_coach_bringup.cli.verbs.plot import COLOURS, FORMATS, INK, save, style
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.play.evaluate import evaluate, evaluation_seed
 from policy_pkg.report.finished_runs import Run, methods_of

@@ -8,8 +8,8 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from crash_coach_bringup.cli.figure_style import COLOURS, INK
 from crash_coach_bringup.cli.report.panels import legend_above, panels
-from crash_coach_bringup.cli.verbs.plot import COLOURS, INK
 from policy_pkg.report.finished_runs import Run
 from policy_pkg.report.rows import Row
 from policy_pkg.train.run_dir import read_run

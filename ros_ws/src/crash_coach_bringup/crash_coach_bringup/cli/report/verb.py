@@ -11,6 +11,7 @@ import typer
 
 from crash_coach_bringup.cli.options import (
     MODE,
+    MOST_EPISODES,
     ModeOption,
     ParamOption,
     conditions,
@@ -21,7 +22,6 @@ from crash_coach_bringup.cli.report.findings import Findings
 from crash_coach_bringup.cli.report.other_tables import as_csv, as_latex
 from crash_coach_bringup.cli.report.page import page
 from crash_coach_bringup.cli.report.time_left import TimeLeft
-from crash_coach_bringup.cli.verbs.evaluate import MOST_EPISODES
 from policy_pkg.play.conditions import Condition, crash_free, named
 from policy_pkg.play.evaluate import evaluation_seed
 from policy_pkg.report.finished_runs import (

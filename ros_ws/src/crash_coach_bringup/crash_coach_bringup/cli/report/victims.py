@@ -8,8 +8,8 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from crash_coach_bringup.cli.figure_style import INK, style
 from crash_coach_bringup.cli.report.panels import legend_above, panels
-from crash_coach_bringup.cli.verbs.plot import INK, style
 from policy_pkg.report.rows import ALL_MAPS, Row
 from policy_pkg.report.victims import Cost
 

@@ -11,6 +11,7 @@ import typer
 
 from crash_coach_bringup.cli.options import (
     MODE,
+    MOST_EPISODES,
     CrashedOption,
     ModeOption,
     ParamOption,
@@ -25,7 +26,6 @@ from crash_coach_bringup.cli.output import (
     table,
     written_first,
 )
-from crash_coach_bringup.cli.verbs.evaluate import MOST_EPISODES
 from policy_pkg.play.conditions import Condition
 from policy_pkg.play.evaluate import Scripted, evaluation_seed, record
 from policy_pkg.statistics import wilson

@@ -9,8 +9,9 @@ from typing import Annotated, Any
 import typer
 
 from crash_coach_bringup.cli.jobs import Job, run_jobs
+from crash_coach_bringup.cli.options import Layout
 from crash_coach_bringup.cli.output import console, percent_ci, table, written_first
-from crash_coach_bringup.cli.verbs.evaluate import ALIKE, Layout, as_json
+from crash_coach_bringup.cli.playing import ALIKE, as_json
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.play.conditions import Condition, crash_free, named
 from policy_pkg.play.evaluate import Evaluation, evaluation_seed

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,20 +15,24 @@ from crash_coach_bringup.cli.curves import (
     group_runs,
     load_run,
 )
+from crash_coach_bringup.cli.figure_style import (
+    FORMATS,
+    INK,
+    STEPS,
+    save,
+    style,
+)
 from crash_coach_bringup.cli.output import (
     CliError,
     check_file_target,
     check_json_target,
     console,
-    not_written,
     written_first,
 )
-from crash_coach_common.whole_output import whole_output
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-FORMATS = ("png", "svg")
 TITLES = {
     "success_rate": "success rate at the run's crash rate α (e_t)",
     "success_crash_free": "success rate without crashes",
@@ -38,14 +42,8 @@ TITLES = {
     "return_crash_free": "mean return without crashes",
     "loss": "loss: what a gradient step lowers",
 }
-STEPS = {"env_steps": "environment steps", "gradient_steps": "gradient steps"}
 PROBABILITIES = {"success_rate", "success_crash_free", "success_1_crashed"}
-# Okabe and Ito's palette, without its yellow, which is too light for a line.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-Dash = Literal["-", "--", "-.", ":"]
-DASHES: tuple[Dash, ...] = ("-", "--", "-.", ":")
 WIDE_LABEL = 50  # characters from which two columns of the legend would not fit
-INK = "#333333"
 
 Curves = dict[str, Curve | None]
 
@@ -75,11 +73,6 @@ def draw(groups: Sequence[Group], curves: Sequence[Curves]) -> Figure:
         figure.supxlabel("\n".join(["○ curve ends early", *notes]), fontsize=8, color=INK)
     figure.legend(handles=handles, loc="outside upper center", ncols=columns, frameon=False)
     return figure
-
-
-def style(index: int) -> tuple[str, Dash]:
-    """Colour and line style of a group."""
-    return COLOURS[index % len(COLOURS)], DASHES[index // len(COLOURS) % len(DASHES)]
 
 
 def draw_panel(ax: Any, key: str, groups: Sequence[Group], curves: Sequence[Curve | None]) -> None:
@@ -122,22 +115,6 @@ def note(group: Group) -> str | None:
     return (
         f"{group.label}: unfinished: {', '.join(open_runs)} of {group.runs[0].total_steps:,} steps"
     )
-
-
-def save(figure: Figure, path: Path, kind: str) -> None:
-    """Writes ``path`` whole or not at all; the same curves give the same file.
-
-    Raises:
-        CliError: it cannot be written.
-    """
-    from matplotlib import rc_context
-
-    metadata = {"Date": None} if kind == "svg" else {}
-    try:
-        with rc_context({"svg.hashsalt": "crash-coach"}), whole_output(path) as temporary:
-            figure.savefig(temporary, format=kind, metadata=metadata)
-    except OSError as error:
-        raise CliError(not_written("--out", path, error)) from None
 
 
 def targets(stem: Path) -> dict[str, Path]:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from crash_coach_bringup.cli.options import Mode
 from crash_coach_bringup.cli.output import CliError
-from crash_coach_bringup.cli.verbs.up import Mode
 
 if TYPE_CHECKING:
     from crash_coach_bringup.ros.graph import Layout

@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crash_coach_bringup.cli.options import NamespaceOption
+from crash_coach_bringup.cli.options import Layout, LayoutOption, Mode, NamespaceOption
 from crash_coach_bringup.cli.output import CliError
-from crash_coach_bringup.cli.verbs.evaluate import Layout, LayoutOption
 from crash_coach_console.serve import PORT
 from policy_pkg.play.conditions import at_rate
 
 if TYPE_CHECKING:
     from crash_coach_bringup.ros.supervisor import Event
-
-
-class Mode(StrEnum):
-    lockstep = "lockstep"
-    realtime = "realtime"
 
 
 RelayOption = Annotated[
