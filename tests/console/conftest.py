@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from console_teams import browser, teams
+from console_teams import browser, episodes, teams
 
-__all__ = ["browser", "teams"]
+__all__ = ["browser", "episodes", "teams"]

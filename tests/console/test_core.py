@@ -157,6 +157,9 @@ def test_a_page_that_comes_late_learns_of_a_fault_from_the_gate() -> None:
     assert states(team) == {"robot_1": ("faulted", "freeze")}
     team.in_force(Plan(0, 5, 0.0, ()))
     assert states(team) == {"robot_1": ("ok", "")}
+    # A line that was written before the clear came behind it.
+    team.diagnosed("gate", "robot_1", "muted", "muted by plan (freeze)", "freeze")
+    assert states(team) == {"robot_1": ("ok", "")}
 
 
 def test_wanted_and_done_of_the_last_steps() -> None:

@@ -152,6 +152,56 @@ def test_two_teams_side_by_side_are_crashed_alike_or_one_alone(two: Page, teams:
     assert left.locator(".chip[data-state=faulted]").count() == 0
 
 
+@pytest.fixture
+def over(browser: Browser, episodes: str) -> Iterator[Page]:
+    """A recording, and beside it a run, without ROS."""
+    made = browser.new_page(viewport=DESK)  # type: ignore[arg-type]
+    made.set_default_timeout(1000 * WAIT_S)
+    made.goto(episodes)
+    made.wait_for_function(
+        "() => crashCoach.stages.length === 2"
+        " && crashCoach.stages.every((stage) => stage.places().length > 0)"
+    )
+    yield made
+    made.close()
+
+
+STEP = "() => crashCoach.stages[{}].motion.newest.step"
+
+
+def test_a_recording_plays_pauses_and_goes_to_any_step(over: Page) -> None:
+    bag = over.locator(".stage").first
+    bag.locator(".episode input").fill("0")
+    bag.locator(".episode input").press("Enter")
+    over.wait_for_function("() => crashCoach.stages[0].motion.newest.step >= 2")
+    bag.get_by_role("button", name="Pause").click()
+    bag.get_by_role("button", name="Play").wait_for()
+    at = over.evaluate(STEP.format(0))
+    bag.get_by_role("button", name="◂ Step").click()
+    over.wait_for_function(f"() => crashCoach.stages[0].motion.newest.step === {at - 1}")
+    bag.get_by_label("Step of the episode").fill("5")
+    over.wait_for_function("() => crashCoach.stages[0].motion.newest.step === 5")
+    bag.locator(".speed select").select_option("10")
+    bag.get_by_role("button", name="Play").click()
+    over.wait_for_function("() => crashCoach.stages[0].motion.newest.ended")
+    bag.locator(".costs tbody tr").first.wait_for()
+
+
+def test_a_run_is_crashed_in_the_same_episode_by_a_double_click(over: Page) -> None:
+    run = over.locator(".stage").nth(1)
+    run.get_by_label("Step of the episode").fill("4")
+    over.wait_for_function("() => crashCoach.stages[1].motion.newest.step === 4")
+    over.wait_for_function("() => !crashCoach.stages[1].dirty")
+    at = over.evaluate("crashCoach.stages[1].places()[1]")
+    run.locator("canvas.arena, .arena canvas").dblclick(position={"x": at["x"], "y": at["y"]})
+    answer = over.locator("#answer", has_text="robot_2: mute from the next step on (from step 4")
+    answer.wait_for()
+    run.locator(".chip[data-state=faulted]", has_text="robot_2").wait_for()
+    run.locator(".costs tbody tr", has_text="robot_2: mute").wait_for()
+    over.keyboard.press("C")
+    over.locator("#answer", has_text="nobody is crashed any more").wait_for()
+
+
 @pytest.mark.parametrize("size", [PHONE, DESK], ids=["375px", "1600px"])
 def test_nothing_is_cut_off(page: Page, size: dict[str, int]) -> None:
     page.set_viewport_size(size)  # type: ignore[arg-type]

@@ -9,12 +9,16 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from bag_maker import Team, write
+from bag_maker import messages as messages_of
 from crash_coach_interfaces.msg import EpisodeState
 from hypothesis import strategies as st
 from rcl_interfaces.srv import GetParameters
@@ -30,10 +34,16 @@ from crash_coach_bringup.ros.graph import (
     graph_processes,
 )
 from crash_coach_bringup.ros.supervisor import Supervisor
+from crash_coach_console.access import Access
+from crash_coach_console.episode_source import EpisodeSource
 from crash_coach_console.operating import WATCHED
+from crash_coach_console.player import Player
+from crash_coach_console.recording import Recording
 from crash_coach_console.ros.graph_source import read_values
+from crash_coach_console.server import Server, make_app
 from crash_coach_pkg.coach.parameters import Value
 from crash_coach_pkg.faults import mode_names
+from policy_pkg.play.target import load_target
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 
@@ -236,6 +246,29 @@ def messages() -> st.SearchStrategy[str]:
 
     requests = st.sampled_from(kinds).flatmap(like)
     return st.text(max_size=40) | anything.map(json.dumps) | requests.map(json.dumps)
+
+
+@pytest.fixture(scope="session")
+def episodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address of a console on a recording and on a scripted team, in this process."""
+    team = Team()
+    folder = tmp_path_factory.mktemp("recording") / "bag"
+    bag = write(folder, team, messages_of([team.play(), team.play()]))
+    sources = [
+        EpisodeSource(0, Recording(bag)),
+        EpisodeSource(1, Player(load_target("scripted:random", SCENARIO))),
+    ]
+    bound: SimpleQueue[int] = SimpleQueue()
+    server = Server(make_app(sources, Access()), "127.0.0.1", 0, bound.put)
+    thread = threading.Thread(target=server.run)
+    for source in sources:
+        source.start()
+    thread.start()
+    yield f"http://127.0.0.1:{bound.get(timeout=WAIT_S)}/"
+    server.should_exit = True
+    thread.join()
+    for source in sources:
+        source.close()
 
 
 def chromium() -> str | None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import json
+import re
 import signal
 import subprocess
 from pathlib import Path
@@ -10,6 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 from ament_index_python.packages import get_package_share_directory
+from crash_coach_interfaces.msg import CrashPlan, EpisodeState
 
 from crash_coach_bringup.ros.client import graph_client
 from crash_coach_bringup.ros.graph import (
@@ -25,6 +28,7 @@ from crash_coach_pkg.coach.config import TeamSpec
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 
+SOURCES = Path(__file__).parents[3] / "ros_ws/src/crash_coach_bringup"
 SHARE = Path(get_package_share_directory("crash_coach_bringup"))
 DEFAULTS = {a.name: a.default or "" for a in ARGUMENTS}
 
@@ -144,3 +148,16 @@ def test_the_rviz_layout_shows_topics_that_the_graph_has() -> None:
     assert layout["Global Options"]["Fixed Frame"] == "map"
     topics = {d["Topic"]["Value"] for d in layout["Displays"] if "Topic" in d}
     assert topics == {"/sim/markers", "/robot_1/odom", "/robot_2/odom"}
+
+
+def test_the_foxglove_layout_shows_topics_that_the_graph_has() -> None:
+    layout = json.loads((SOURCES / "foxglove" / "team.json").read_text())
+    panels = layout["configById"]
+    assert set(re.findall(r'"([^"]+![a-z]+)"', json.dumps(layout["layout"]))) == set(panels)
+    assert list(panels["3D!team"]["topics"]) == ["/sim/markers"]
+    assert panels["3D!team"]["followTf"] == "map"
+    assert panels["DiagnosticSummary!team"]["topicToRender"] == "/diagnostics"
+    paths = [path["value"] for path in panels["Plot!return"]["paths"]]
+    fields = {"/sim/episode": EpisodeState, "/coach/plan": CrashPlan}
+    for topic, _, field in (path.partition(".") for path in paths):
+        assert field in fields[topic].get_fields_and_field_types()

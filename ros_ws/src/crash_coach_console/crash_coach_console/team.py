@@ -41,6 +41,7 @@ class Plan:
 @dataclass
 class _Robot:
     mode: str = ""  # of the fault in force
+    told: bool = False  # whether events have told of it: diagnostics lag behind them
     lost: dict[str, str] = field(default_factory=dict)  # who says so, and in which words
     note: str = ""
     taken: deque[list[Any]] = field(default_factory=lambda: deque(maxlen=KEPT_STEPS))
@@ -77,7 +78,7 @@ class LiveTeam:
         if number != self._episode:
             self._episode = number
             for robot in self._robots.values():
-                robot.mode = ""
+                robot.mode, robot.told = "", True
                 robot.effects.clear()
             self.changed = True
 
@@ -97,14 +98,16 @@ class LiveTeam:
         """A fault is in force on ``robot`` from now on."""
         if robot in self._robots and episode >= self._episode:
             self._robots[robot].mode = mode
+            self._robots[robot].told = True
             self.changed = True
 
     def cleared(self, robot: str) -> None:
         """The fault of ``robot`` is over; '': of everybody."""
         for name, state in self._robots.items():
-            if robot in ("", name) and state.mode:
+            if robot in ("", name):
+                state.told = True
+                self.changed = self.changed or bool(state.mode)
                 state.mode = ""
-                self.changed = True
 
     def effect(
         self, robot: str, mode: str, key: tuple[int, int], intent: int, applied: int
@@ -118,6 +121,7 @@ class LiveTeam:
             del state.effects[next(iter(state.effects))]
         if key[0] >= self._episode and state.mode != mode:
             state.mode = mode
+        state.told = True
         self.changed = True
 
     def executed(self, episode: int, step: int, actions: Sequence[int]) -> None:
@@ -132,7 +136,8 @@ class LiveTeam:
         self.changed = True
 
     def diagnosed(self, who: str, robot: str, state: str, words: str, mode: str | None) -> None:
-        """A line of /diagnostics. who: sim or gate; mode: in force, as the gate has it."""
+        """A line of /diagnostics. who: sim or gate; mode: in force, as the gate has it: it counts
+        until an event tells of the robot."""
         known = self._robots.get(robot)
         if known is None:
             return
@@ -143,7 +148,7 @@ class LiveTeam:
             known.lost.pop(who, None)
         if who == "gate":
             known.note = words if state == OK and words != OK else ""
-        if mode is not None and state != LOST:
+        if mode is not None and state != LOST and not known.told:
             known.mode = mode
         self.changed = self.changed or before != (known.lost, known.note, known.mode)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import struct
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -15,6 +14,7 @@ from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue
 from rclpy.parameter import Parameter, parameter_value_to_python
 
+from crash_coach_common import cdr
 from crash_coach_common.contract import UserError
 from crash_coach_console.arena import Arena, State, pairs
 from crash_coach_console.team import Plan, PlannedFault
@@ -36,9 +36,6 @@ _SIDES = {
     ArenaMessage.THINGS: "things",
 }
 _NS = 1e-9
-_LITTLE_ENDIAN = b"\x00\x01"
-_LENGTH = struct.Struct("<I")
-_FRAME_ID_AT = 16
 
 
 def arena_from_message(message: ArenaMessage) -> Arena:
@@ -126,13 +123,12 @@ def plan_from_message(message: CrashPlan) -> Plan:
 def event_kind(data: bytes) -> int:
     """Of a serialized FaultEvent, without reading the rest: there may be hundreds a second.
 
-    The layout is plain little-endian CDR: encapsulation (4 bytes), stamp (8), frame_id with its
-    length, kind. Anything else, or cut short: -1.
+    -1: it is not little-endian CDR, or cut short.
     """
-    if data[:2] != _LITTLE_ENDIAN or len(data) < _FRAME_ID_AT:
+    if data[:2] != cdr.LITTLE_ENDIAN or len(data) < cdr.FRAME_ID_AT:
         return -1
-    (length,) = _LENGTH.unpack_from(data, _FRAME_ID_AT - _LENGTH.size)
-    at = _FRAME_ID_AT + length
+    (length,) = cdr.COUNT.unpack_from(data, cdr.FRAME_ID_AT - cdr.COUNT.size)
+    at = cdr.FRAME_ID_AT + length  # a byte needs no padding
     return data[at] if at < len(data) else -1
 
 

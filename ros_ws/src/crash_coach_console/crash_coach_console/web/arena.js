@@ -23,21 +23,27 @@ export function project([x1, y1, x2, y2], width, height) {
 }
 
 /** What to look at: the whole arena, or of a large one without places the part where things are. */
-export function lookAt(arena, state) {
+export function lookAt(arena, state, aspect) {
   const [x1, y1, x2, y2] = arena.walled_m;
   const size = Math.max(x2 - x1, y2 - y1);
   if (arena.cell_m > 0 || arena.sites_m.length || size <= SMALL_M) return arena.walled_m;
   const alive = arena.actors.flatMap((_, i) => (state.health[i] > 0 ? [i] : []));
   if (!alive.length) return arena.walled_m;
   const [xs, ys] = [alive.map((i) => state.poses[3 * i]), alive.map((i) => state.poses[3 * i + 1])];
-  const [left, right] = widen(Math.min(...xs), Math.max(...xs), LEAST_SHARE * size, x1, x2);
-  const [low, high] = widen(Math.min(...ys), Math.max(...ys), LEAST_SHARE * size, y1, y2);
+  const [minX, maxX, minY, maxY] = [
+    Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys),
+  ];
+  const width = Math.max(maxX - minX + 2 * AROUND_M, LEAST_SHARE * size);
+  const height = Math.max(maxY - minY + 2 * AROUND_M, LEAST_SHARE * size);
+  // As wide for its height as the canvas, as far as there is arena.
+  const [left, right] = widen(minX, maxX, Math.max(width, height * aspect), x1, x2);
+  const [low, high] = widen(minY, maxY, Math.max(height, width / aspect), y1, y2);
   return [left, low, right, high];
 }
 
-/** At least so long, with room around, and within the limits. */
-function widen(from, to, least, low, high) {
-  const length = Math.min(high - low, Math.max(to - from + 2 * AROUND_M, least));
+/** So long, around the middle of what is to be seen, and within the limits. */
+function widen(from, to, wanted, low, high) {
+  const length = Math.min(high - low, wanted);
   const start = Math.min(high - length, Math.max(low, (from + to - length) / 2));
   return [start, start + length];
 }

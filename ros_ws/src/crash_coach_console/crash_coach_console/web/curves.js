@@ -10,7 +10,7 @@ const NAMES = {
   success_worst: "success, worst victim",
   alpha: "crash rate α",
 };
-const MARGIN = { left: 34, right: 10, top: 8, bottom: 22 };
+const MARGIN = { left: 40, right: 10, top: 8, bottom: 22 };
 
 export class Curves {
   /** @param {Element} place the panel */

@@ -229,6 +229,7 @@ export class Stage {
       life.hidden = false;
       life.firstElementChild.style.width = `${100 * state.health[actor]}%`;
       life.classList.toggle("low", state.health[actor] <= 0.35);
+      chips[i].firstElementChild.classList.toggle("dead", state.health[actor] <= 0);
     });
   }
 
@@ -275,7 +276,7 @@ export class Stage {
 
   /** Towards what is to be looked at, calmly; whether it is still on its way. */
   moveCamera(state, now) {
-    const target = draw.lookAt(this.arena, state);
+    const target = draw.lookAt(this.arena, state, this.canvas.width / this.canvas.height);
     const share = 1 - Math.exp(-(now - (this.movedAt ?? now)) / CAMERA_MS);
     this.movedAt = now;
     const from = this.camera ?? target;

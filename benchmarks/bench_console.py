@@ -1,0 +1,169 @@
+"""Benchmark rows of the console: what an open page costs a graph, and the console itself.
+
+Run alone: ``python -m benchmarks bench_console``. Rates with and without the console are those of
+one graph, in turn.
+"""
+
+from __future__ import annotations
+
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import psutil
+import yaml
+from websockets.sync.client import connect
+
+from benchmarks.bench_ros import START_S, WARM_UP_S, WINDOW_S, refuse_dead, sample
+from crash_coach_bringup.ros.client import graph_client
+from crash_coach_bringup.ros.domain import reserve_domain
+from crash_coach_bringup.ros.graph import (
+    UpOptions,
+    check_team,
+    graph_environment,
+    graph_processes,
+)
+from crash_coach_bringup.ros.supervisor import Supervisor
+from policy_pkg.untrained import write_untrained
+from sim_pkg.env import make_env
+
+PAIRS = 4
+TARGET_SHARE = 0.9
+MANY, HZ = 32, 10.0
+Row = dict[str, Any]
+
+
+@contextmanager
+def open_page(domain: int) -> Iterator[psutil.Process]:
+    """A console of its own process, and a page that reads all it is told."""
+    command = [sys.executable, "-m", "crash_coach_console.command", "--port", "0"]
+    console = subprocess.Popen(
+        [*command, "--domain", str(domain)], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert console.stdout is not None
+        address = console.stdout.readline().removeprefix("console: http://").strip()
+        stop, drawn = threading.Event(), threading.Event()
+
+        def read() -> None:
+            with connect(f"ws://{address}live", open_timeout=START_S) as page:
+                while not stop.is_set():
+                    if '"type":"state"' in str(page.recv(timeout=START_S)):
+                        drawn.set()
+
+        reader = threading.Thread(target=read)
+        reader.start()
+        if not drawn.wait(START_S):
+            raise RuntimeError("the console showed nothing")
+        yield psutil.Process(console.pid)
+        stop.set()
+        reader.join()
+    finally:
+        console.terminate()
+        console.wait()
+
+
+def rate(client: Any, supervisor: Supervisor, dt_s: float) -> float:
+    """Control steps per second."""
+    refuse_dead(supervisor, WARM_UP_S)
+    start_s, first = sample(client, dt_s)
+    refuse_dead(supervisor, WINDOW_S)
+    end_s, last = sample(client, dt_s)
+    return (last - first) / (end_s - start_s)
+
+
+def running(
+    stack: ExitStack, folder: Path, scenario: str, **options: Any
+) -> tuple[int, Any, Supervisor, float]:
+    """A graph of untrained robots: its domain, a client, its processes and dt_s."""
+    spec = make_env(scenario, 1).spec
+    checkpoint = folder / f"{spec.n_robots}" / "step_0"
+    write_untrained(checkpoint, spec, seed=0)
+    up = UpOptions(scenario, checkpoint, layout="team", **options)
+    domain = stack.enter_context(reserve_domain())
+    supervisor = stack.enter_context(
+        Supervisor(
+            graph_processes(up, check_team(up)),
+            folder / "logs",
+            graph_environment(domain),
+            throughput=up.mode == "lockstep",
+        )
+    )
+    client = stack.enter_context(
+        graph_client("meter", domain, lambda: refuse_dead(supervisor, 0.0))
+    )
+    return domain, client, supervisor, spec.dt_s
+
+
+def cost_row(folder: Path) -> Row:
+    """Lock-step, 8 robots: the rate with a page open over that without."""
+    pairs = []
+    with ExitStack() as stack:
+        domain, client, supervisor, dt_s = running(stack, folder, "buttons_8")
+        sample(client, dt_s)
+        for _ in range(PAIRS):
+            without = rate(client, supervisor, dt_s)
+            with open_page(domain):
+                pairs.append((rate(client, supervisor, dt_s), without))
+    ratio = statistics.median(shown / without for shown, without in pairs)
+    return {
+        "name": "console lock-step 8 robots, a page open against none",
+        "value": round(statistics.median(shown for shown, _ in pairs), 1),
+        "unit": "steps/s",
+        "reference": round(statistics.median(without for _, without in pairs), 1),
+        "ratio": round(ratio, 3),
+        "target": f">= {TARGET_SHARE:g}",
+        "ok": ratio >= TARGET_SHARE,
+    }
+
+
+def many_robots(folder: Path) -> Path:
+    """A grid-world of MANY robots, made of the one of 16."""
+    shipped = Path(make_env.__code__.co_filename).parent / "configs/scenarios/buttons_16.yaml"
+    config = yaml.safe_load(shipped.read_text())
+    taken = {tuple(cell) for cell in config["starts"] + config["buttons"]}
+    free = [[r, c] for r in range(10) for c in range(10) if (r, c) not in taken]
+    config["starts"] += free[: MANY - len(config["starts"])]
+    path = folder / f"buttons_{MANY}.yaml"
+    path.write_text(yaml.safe_dump(config))
+    return path
+
+
+def share_row(folder: Path) -> Row:
+    """Real time, MANY robots at HZ: the console's share of one core."""
+    with ExitStack() as stack:
+        scenario = str(many_robots(folder))
+        sim = {"real_time_factor": HZ}  # a control step is one second
+        domain, client, supervisor, dt_s = running(
+            stack, folder, scenario, mode="realtime", sim=sim
+        )
+        sample(client, dt_s)
+        with open_page(domain) as console:
+            refuse_dead(supervisor, WARM_UP_S)
+            before, start_s = sum(console.cpu_times()[:2]), time.perf_counter()
+            refuse_dead(supervisor, 2 * WINDOW_S)
+            used_s = sum(console.cpu_times()[:2]) - before
+            share = used_s / (time.perf_counter() - start_s)
+    return {
+        "name": f"console CPU, {MANY} robots at {HZ:g} Hz in real time, a page open",
+        "value": round(100 * share, 1),
+        "unit": "% of a core",
+        "reference": None,
+        "ratio": None,
+        "target": None,
+        "ok": True,
+    }
+
+
+def rows() -> list[Row]:
+    """All rows: {name, value, unit, reference, ratio, target, ok}."""
+    with tempfile.TemporaryDirectory(prefix="crash_coach_bench_") as text:
+        folder = Path(text)
+        return [cost_row(folder), share_row(folder)]
