@@ -136,6 +136,10 @@ OnProgress = Callable[[ProgressReport], None]
 def silent(report: ProgressReport) -> None: ...
 
 
+def _never() -> bool:
+    return False
+
+
 def _untold(line: Mapping[str, Value]) -> None: ...
 
 
@@ -147,6 +151,7 @@ def train(
     clock: Clock = time.perf_counter,
     environment: MakeEnv = make_any_env,
     opened: Callable[[TrainSession], None] = lambda session: None,
+    stopped: Callable[[], bool] = _never,
 ) -> RunSummary:
     """Trains until ``config.total_steps`` on episodes that are played in this process.
 
@@ -157,8 +162,10 @@ def train(
         clock: monotonic, seconds.
         environment: makes the environment of a scenario with a number of arenas.
         opened: told the session before its first step.
+        stopped: asked between steps whether to save and end early.
 
     Raises:
+        EndedEarly: ``stopped`` said so; there is a checkpoint, unless it was at step 0.
         UserError: the config does not fit the scenario, ``out_dir`` cannot be used, a checkpoint
             is damaged, training diverged, or the result could not be written.
     """
@@ -166,7 +173,12 @@ def train(
     env = environment(scenario, config.n_envs)
     test_env = environment(scenario, min(TEST_ARENAS, config.test_episodes))
     session = TrainSession(config, env, test_env)
-    with Run(session, out_dir, resume, progress, clock, scenario=scenario) as run:
+    with Run(
+        *(session, out_dir, resume, progress, clock),
+        stopped=stopped,
+        scenario=scenario,
+        save_stopped=True,
+    ) as run:
         opened(session)
         return run.go()
 
@@ -179,6 +191,7 @@ class Run:
         warnings: what the user should know before the first step.
         on_block: told a block's line once it is written, before what follows.
         stopped: asked between steps whether to end early, as the last checkpoint leaves it.
+        save_stopped: make that a checkpoint of where it stands.
         scenario: what a new run keeps a copy of.
 
     Raises:
@@ -195,11 +208,12 @@ class Run:
         data: dict[str, Any] | None = None,
         warnings: Sequence[str] = (),
         on_block: Callable[[dict[str, Value]], None] = _untold,
-        stopped: Callable[[], bool] = lambda: False,
+        stopped: Callable[[], bool] = _never,
         scenario: ScenarioSource | None = None,
+        save_stopped: bool = False,
     ) -> None:
         self._session, self._out_dir, self._resume, self._data = session, out_dir, resume, data
-        self._scenario = scenario
+        self._scenario, self._save_stopped = scenario, save_stopped
         self._progress, self._clock = progress, clock
         self._on_block, self._stopped = on_block, stopped
         self._warnings = deque(warnings)
@@ -248,6 +262,8 @@ class Run:
             if session.finished:
                 break
             if self._stopped():
+                if self._save_stopped and session.steps != self._saved_steps:
+                    self._save()
                 raise EndedEarly
             self._advance()
         self._report("finished")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,7 @@ def train_offline(
     clock: Clock = time.perf_counter,
     environment: MakeEnv = make_env,
     sources: Sequence[str] = (),
+    stopped: Callable[[], bool] = lambda: False,
 ) -> RunSummary:
     """Takes ``config.gradient_steps`` on recorded episodes.
 
@@ -50,8 +51,10 @@ def train_offline(
         clock: monotonic, seconds.
         environment: makes the environment of a scenario with a number of arenas.
         sources: where the recordings come from, for ``run.json``.
+        stopped: asked between steps whether to save and end early.
 
     Raises:
+        EndedEarly: ``stopped`` said so; there is a checkpoint, unless it was at step 0.
         UserError: data, config and scenario do not fit together, ``out_dir`` cannot be used,
             a checkpoint is damaged, training diverged, or the result could not be written.
     """
@@ -62,7 +65,12 @@ def train_offline(
     env = None if scenario is None else environment(scenario, arenas)
     session = OfflineSession(config, data, env)
     described, told = describe_data(session, sources), warnings(session)
-    with Run(session, out_dir, resume, progress, clock, described, told, scenario=scenario) as run:
+    with Run(
+        *(session, out_dir, resume, progress, clock, described, told),
+        stopped=stopped,
+        scenario=scenario,
+        save_stopped=True,
+    ) as run:
         return run.go()
 
 

@@ -28,7 +28,7 @@ from policy_pkg.statistics import binomial_weights
 from policy_pkg.train.offline.config import OfflineConfig
 from policy_pkg.train.offline.data import load_data
 from policy_pkg.train.offline.session import MEANS, OfflineSession
-from policy_pkg.train.run import ProgressReport, TrainError
+from policy_pkg.train.run import EndedEarly, ProgressReport, TrainError
 from policy_pkg.train.run_dir import RunError
 
 DOCUMENT = Path(__file__).resolve().parents[4] / "docs" / "algorithms.md"
@@ -150,6 +150,18 @@ def test_stopping_anywhere_and_resuming_changes_no_bit(
             train_offline(config, recordings, run, progress=stop, clock=clock)
         train_offline(config, recordings[::-1], run, resume=True)
         assert_same_run(run, whole)
+
+
+def test_stopping_by_request_saves_where_it_stands(
+    tmp_path: Path, recordings: list[Recording]
+) -> None:
+    config, asked = METHODS["conservative"], iter(range(10**9))
+    train_offline(config, recordings, tmp_path / "whole")
+    with pytest.raises(EndedEarly):
+        train_offline(config, recordings, tmp_path / "run", stopped=lambda: next(asked) >= 33)
+    assert (tmp_path / "run" / "checkpoints" / "step_000000033").is_dir()
+    train_offline(config, recordings, tmp_path / "run", resume=True)
+    assert_same_run(tmp_path / "run", tmp_path / "whole")
 
 
 def test_another_seed_gives_another_run(tmp_path: Path, recordings: list[Recording]) -> None:

@@ -6,6 +6,8 @@ import multiprocessing
 import os
 import queue
 import signal
+import threading
+import time
 import traceback
 from dataclasses import dataclass
 from multiprocessing.queues import Queue
@@ -16,6 +18,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from crash_coach_bringup.cli.output import console
 from crash_coach_common.contract import UserError
+from policy_pkg.checkpoint import CHECKPOINTS, list_checkpoints
 
 if TYPE_CHECKING:
     from multiprocessing.process import BaseProcess
@@ -23,6 +26,7 @@ if TYPE_CHECKING:
     from policy_pkg.train.config import TrainConfig
 
 POLL_S = 0.2
+SAVE_S = 120.0  # for a checkpoint with a large replay, on a slow disk
 
 
 @dataclass(frozen=True)
@@ -40,15 +44,16 @@ class Message:
     """What a training process tells its parent."""
 
     job: int
-    kind: str  # "progress", "done" or "failed"
+    kind: str  # "progress", "done", "stopped" or "failed"
     content: Any  # ProgressReport, TrainSummary, or the error's text
 
 
 def _work(index: int, job: Job, parent: int, out: Queue[Message]) -> None:
     """A training process; ends by itself where its parent is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    interrupted = threading.Event()
+    signal.signal(signal.SIGINT, lambda *_: interrupted.set())
     # Imported here: only training processes need torch.
-    from policy_pkg.train.run import train
+    from policy_pkg.train.run import EndedEarly, train
 
     def report(progress: Any) -> None:
         if os.getppid() != parent:
@@ -56,7 +61,11 @@ def _work(index: int, job: Job, parent: int, out: Queue[Message]) -> None:
         out.put(Message(index, "progress", progress))
 
     try:
-        summary = train(job.config, job.out_dir, resume=job.resume, progress=report)
+        summary = train(
+            *(job.config, job.out_dir, job.resume), progress=report, stopped=interrupted.is_set
+        )
+    except EndedEarly:
+        out.put(Message(index, "stopped", None))
     except UserError as error:
         out.put(Message(index, "failed", str(error)))
     except Exception:  # noqa: BLE001 - a defect: its traceback belongs to the parent's output
@@ -124,6 +133,8 @@ class _Runner:
         if message.kind == "done":
             self.results[message.job] = message.content
             self.bars.update(task, completed=1.0)
+        elif message.kind == "stopped":
+            self.bars.update(task, figures="stopped")
         else:
             self.errors[message.job] = message.content
             self.bars.update(task, figures="[red]failed[/red]")
@@ -137,6 +148,20 @@ class _Runner:
                 self.bars.update(self.tasks[index], figures="[red]died[/red]")
                 del self.running[index]
 
+    def stop(self) -> None:
+        """Lets every run save where it stands, and says how to go on; a second Ctrl-C ends it."""
+        for process in self.running.values():
+            if process.pid is not None and process.is_alive():
+                os.kill(process.pid, signal.SIGINT)  # those in the terminal's group have it twice
+        end_s = time.monotonic() + SAVE_S
+        while self.running and time.monotonic() < end_s:
+            try:
+                self.take(self.messages.get(timeout=POLL_S))
+            except queue.Empty:
+                self.reap()
+        for job in self.jobs:
+            console.print(tell_stopped(job.out_dir), markup=False, highlight=False, soft_wrap=True)
+
     def run(self) -> None:
         try:
             while self.waiting or self.running:
@@ -145,10 +170,22 @@ class _Runner:
                     self.take(self.messages.get(timeout=POLL_S))
                 except queue.Empty:
                     self.reap()
+        except KeyboardInterrupt:
+            self.stop()
+            raise
         finally:
             for process in self.running.values():
                 process.terminate()
                 process.join()
+
+
+def tell_stopped(run: Path) -> str:
+    """Where an interrupted run stands, and how it goes on."""
+    made = list_checkpoints(run / CHECKPOINTS)
+    if not made:
+        return f"{run}: interrupted before there was anything to save"
+    steps = int(made[-1].name.removeprefix("step_"))
+    return f"{run}: saved at {steps:,} steps; the same command with --resume goes on from there"
 
 
 def run_jobs(jobs: list[Job], workers: int | None = None) -> list[Any]:

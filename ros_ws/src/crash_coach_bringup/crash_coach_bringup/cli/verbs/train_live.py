@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
+from signal import SIGINT
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from crash_coach_bringup.cli.jobs import tell_stopped
 from crash_coach_bringup.cli.options import Mode
-from crash_coach_bringup.cli.output import CliError
+from crash_coach_bringup.cli.output import CliError, console
+from crash_coach_bringup.cli.signals import exit_code
 
 if TYPE_CHECKING:
     from crash_coach_bringup.ros.graph import Layout
@@ -74,4 +77,7 @@ def train_live(
         layout=LAYOUTS[layout],
         log_dir=logs,
     )
-    raise typer.Exit(run_live(options, show, typer.echo))
+    code = run_live(options, show, typer.echo)
+    if code == exit_code(SIGINT):
+        console.print(tell_stopped(out), markup=False, highlight=False, soft_wrap=True)
+    raise typer.Exit(code)

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
+from crash_coach_bringup.cli import signals
+from crash_coach_bringup.cli.jobs import tell_stopped
 from crash_coach_bringup.cli.output import CliError, console
 from policy_pkg.bags.dataset import load_episodes
 from policy_pkg.bags.problems import Problem
@@ -103,6 +105,7 @@ def train_runs(
     """
     # Imported here: the other verbs do without torch.
     from policy_pkg.train.offline import run as offline
+    from policy_pkg.train.run import EndedEarly
 
     columns = (TextColumn("{task.description}"), BarColumn(bar_width=24))
     with Progress(*columns, TextColumn("{task.fields[figures]}"), console=console) as bars:
@@ -114,14 +117,20 @@ def train_runs(
                 "and content): a recording is named twice; name it once, or give --repeated"
             )
         for run, settings in runs.items():
-            summary = offline.train_offline(
-                settings,
-                data,
-                run,
-                resume=resume,
-                progress=_Bar(bars, tasks[run]).show,
-                sources=[str(path) for path in bags],
-            )
+            with signals.noted() as interrupted:
+                try:
+                    summary = offline.train_offline(
+                        settings,
+                        data,
+                        run,
+                        resume=resume,
+                        progress=_Bar(bars, tasks[run]).show,
+                        sources=[str(path) for path in bags],
+                        stopped=interrupted,
+                    )
+                except EndedEarly:
+                    console.print(tell_stopped(run), markup=False, soft_wrap=True)
+                    raise KeyboardInterrupt from None
             steps, episodes = summary.gradient_steps, summary.episodes
             console.print(
                 f"{steps:,} gradient steps on {episodes:,} episodes in {summary.wall_s:.0f} s"
