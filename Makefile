@@ -8,7 +8,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= pytest
 # `make check` runs these, `make test` all others.
 CHECKED := tests/test_architecture.py tests/test_documents.py
 CODE := sim_pkg policy_pkg crash_coach_pkg ros_ws/src/crash_coach_common ros_ws/src/crash_coach_bringup \
-    ros_ws/src/crash_coach_console tests benchmarks scripts
+    ros_ws/src/crash_coach_console tests benchmarks scripts examples
 PAGE := ros_ws/src/crash_coach_console/crash_coach_console/web
 
 .PHONY: help setup check test demo bench soak ray environments format lock clean

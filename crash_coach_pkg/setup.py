@@ -15,6 +15,7 @@ setup(
         "crash_coach_pkg.faults",
         "crash_coach_pkg.gate",
         "crash_coach_pkg.ros",
+        "crash_coach_pkg.wrappers",
     ],
     package_data={"crash_coach_pkg": ["configs/**/*.yaml"]},
     data_files=[
@@ -22,6 +23,7 @@ setup(
         (f"share/{package}", ["package.xml"]),
     ],
     install_requires=["setuptools"],
+    extras_require={"wrappers": ["numpy", "pydantic", "pettingzoo", "gymnasium"]},
     zip_safe=False,
     entry_points={
         "console_scripts": [

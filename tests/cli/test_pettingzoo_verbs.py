@@ -13,7 +13,7 @@ from in_process import refused, typed
 from crash_coach_common.strict_yaml import ConfigError
 from policy_pkg.sweep.config import load_sweep
 
-SIM_TESTS = Path(__file__).parent.parent / "sim"
+SUPPORT = Path(__file__).resolve().parent.parent / "support"
 SETTINGS = (
     "scenario=pettingzoo:corridor_env:Corridor", "env_args.length=5", "env_rules.stay_action=0",
     "env_rules.success_info=all_through", "total_steps=1200", "n_envs=4", "batch_episodes=4",
@@ -25,8 +25,8 @@ SETTINGS = (
 @pytest.fixture(scope="module", autouse=True)
 def importable() -> None:
     """Also in the processes that the verbs start."""
-    sys.path.insert(0, str(SIM_TESTS))
-    os.environ["PYTHONPATH"] = f"{SIM_TESTS}:{os.environ.get('PYTHONPATH', '')}"
+    sys.path.insert(0, str(SUPPORT))
+    os.environ["PYTHONPATH"] = f"{SUPPORT}:{os.environ.get('PYTHONPATH', '')}"
 
 
 @pytest.fixture(scope="module")

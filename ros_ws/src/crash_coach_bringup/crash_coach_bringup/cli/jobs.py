@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
+from crash_coach_bringup.cli import signals
 from crash_coach_bringup.cli.output import console
 from crash_coach_common.contract import UserError
 from policy_pkg.checkpoint import CHECKPOINTS, list_checkpoints
@@ -163,16 +164,19 @@ class _Runner:
             console.print(tell_stopped(job.out_dir), markup=False, highlight=False, soft_wrap=True)
 
     def run(self) -> None:
+        """Raises KeyboardInterrupt after Ctrl-C, when every run has saved."""
         try:
-            while self.waiting or self.running:
-                self.start_free()
-                try:
-                    self.take(self.messages.get(timeout=POLL_S))
-                except queue.Empty:
-                    self.reap()
-        except KeyboardInterrupt:
-            self.stop()
-            raise
+            # A flag: the first message loads torch, in which an exception would leave a ruin.
+            with signals.noted() as interrupted:
+                while (self.waiting or self.running) and not interrupted():
+                    self.start_free()
+                    try:
+                        self.take(self.messages.get(timeout=POLL_S))
+                    except queue.Empty:
+                        self.reap()
+            if interrupted():
+                self.stop()
+                raise KeyboardInterrupt
         finally:
             for process in self.running.values():
                 process.terminate()

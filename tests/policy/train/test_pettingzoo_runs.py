@@ -21,15 +21,15 @@ from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.run import train
 from policy_pkg.train.run_dir import RunError, kept_scenario, scenario_of
 
-SIM_TESTS = Path(__file__).parent.parent / "sim"
+SUPPORT = Path(__file__).resolve().parents[2] / "support"
 AGENT = "checkpoints/step_000001200/agent.safetensors"
 
 
 @pytest.fixture(scope="module", autouse=True)
 def importable() -> Iterator[None]:
-    sys.path.insert(0, str(SIM_TESTS))
+    sys.path.insert(0, str(SUPPORT))
     yield
-    sys.path.remove(str(SIM_TESTS))
+    sys.path.remove(str(SUPPORT))
 
 
 def corridor(rules: dict[str, Any] | None = None, **changes: Any) -> TrainConfig:
