@@ -60,10 +60,13 @@ class Film(Protocol):
         ...
 
 
-def write_video(frames: Frames | Pictures, path: Path, speed: float = 1.0) -> None:
+def write_video(
+    frames: Frames | Pictures, path: Path, speed: float = 1.0, caption: str = ""
+) -> None:
     """Writes ``path``, a .mp4 (H.264) or .gif by its suffix; it is complete or not there.
 
     Args:
+        caption: as of Stage; pictures of a foreign environment have none.
         speed: simulated seconds per second of the film, above 0.
 
     Raises:
@@ -77,7 +80,7 @@ def write_video(frames: Frames | Pictures, path: Path, speed: float = 1.0) -> No
         raise ValueError(f"{path}: a film is a .mp4 or .gif file")
     write, fps = writers[path.suffix]
     path.parent.mkdir(parents=True, exist_ok=True)
-    film = PictureFilm(frames) if isinstance(frames, Pictures) else _Film(frames)
+    film = PictureFilm(frames) if isinstance(frames, Pictures) else _Film(frames, caption)
     with whole_output(path) as temporary:
         write(film, _times(frames, fps, speed), temporary)
 
@@ -130,9 +133,9 @@ def _times(frames: Frames | Pictures, fps: int, speed: float) -> npt.NDArray[np.
 class _Film:
     """The stage and the artists that move on it."""
 
-    def __init__(self, frames: Frames) -> None:
+    def __init__(self, frames: Frames, caption: str) -> None:
         self._frames = frames
-        self._stage = stage = Stage(frames, _legend(frames))
+        self._stage = stage = Stage(frames, _legend(frames), caption)
         self._discs = [i for i, actor in enumerate(frames.actors) if actor.size_m is None]
         self._boxes = [i for i, actor in enumerate(frames.actors) if actor.size_m is not None]
         self._radii = np.array([frames.actors[i].radius_m for i in self._discs])

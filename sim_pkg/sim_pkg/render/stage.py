@@ -33,7 +33,7 @@ SHIELD = "#56B4E9"
 
 DPI = 100
 WIDTH_IN = 9.0
-HEADER_IN, FOOTER_IN, MARGIN_IN = 0.5, 0.5, 0.12
+HEADER_IN, FOOTER_IN, MARGIN_IN = 0.72, 0.5, 0.12
 FONT_PT = 12
 MAX_ASPECT = 1.05  # height over width of the view
 _LEAST_M = 8.0  # the view is never narrower
@@ -67,9 +67,13 @@ def _widened(low: float, high: float, least: float, limit: float) -> tuple[float
 
 
 class Stage:
-    """A figure with the arena of ``frames``; x and y of ``ax`` are metres."""
+    """A figure with the arena of ``frames``; x and y of ``ax`` are metres.
 
-    def __init__(self, frames: Frames, legend: Sequence[Any]) -> None:
+    Args:
+        caption: who acts, and what happens to whom: a line above the episode's own.
+    """
+
+    def __init__(self, frames: Frames, legend: Sequence[Any], caption: str = "") -> None:
         self.view = view_of(frames)
         x1, y1, x2, y2 = self.view
         inner = WIDTH_IN - 2 * MARGIN_IN
@@ -83,17 +87,27 @@ class Stage:
             (MARGIN_IN / WIDTH_IN, FOOTER_IN / height, inner / WIDTH_IN, tall / height)
         )
         self.pixels_per_m = inner * DPI / (x2 - x1)
-        top = 1 - 0.5 * HEADER_IN / height
+        upper, lower = (1 - share * HEADER_IN / height for share in (0.3, 0.7))
         style: dict[str, Any] = {"va": "center", "fontsize": FONT_PT, "color": INK}
         side = MARGIN_IN / WIDTH_IN
-        self.title = self.figure.text(side, top, "", ha="left", **style)
-        self.clock = self.figure.text(1 - side, top, "", ha="right", **style)
+        self.caption = self.figure.text(side, upper, caption, ha="left", weight="bold", **style)
+        self.title = self.figure.text(side, lower, "", ha="left", **style)
+        self.clock = self.figure.text(1 - side, lower, outcome(frames), ha="right", **style)
         self._draw_arena(frames)
+        self._shrink(self.caption)
+        self._shrink(self.title, self.clock)
         self.figure.legend(
             handles=list(legend), loc="lower center", ncols=len(legend), frameon=False,
             fontsize=FONT_PT - 1, bbox_to_anchor=(0.5, 0.0), borderaxespad=0.3,
             handletextpad=0.4, columnspacing=1.2, handlelength=1.4,
         )  # fmt: skip
+
+    def _shrink(self, *texts: Any) -> None:
+        """Makes the texts of a line as small as it takes to stand beside each other."""
+        free = self.figure.bbox.width - (1 + len(texts)) * MARGIN_IN * DPI
+        width = sum(text.get_window_extent(self.canvas.get_renderer()).width for text in texts)
+        for text in texts:
+            text.set_fontsize(FONT_PT * min(1.0, free / max(1.0, width)))
 
     def _draw_arena(self, frames: Frames) -> None:
         ax, (x1, y1, x2, y2) = self.ax, self.view
@@ -172,12 +186,13 @@ def site_colour(scene: Scene, index: int) -> str:
     return SITES[index % len(SITES)] if scene.site_radius_m == 0 else SITES[0]
 
 
-def sites(scene: Scene) -> list[Patch]:
-    """A patch per site: cells of a grid, or discs."""
+def sites(scene: Scene, done: Sequence[bool] = ()) -> list[Patch]:
+    """A patch per site: cells of a grid, or discs; ``done``: of each, if any may be."""
     cell, radius = scene.cell_m or 1.0, scene.site_radius_m
     out: list[Patch] = []
     for i, (x, y) in enumerate(scene.sites_m):
-        style: dict[str, Any] = {"facecolor": site_colour(scene, i), "zorder": 2}
+        colour = SITE_DONE if i < len(done) and done[i] else site_colour(scene, i)
+        style: dict[str, Any] = {"facecolor": colour, "zorder": 2}
         if radius > 0:
             out.append(Circle((x, y), radius, **style))
         else:

@@ -21,25 +21,30 @@ from sim_pkg.render.stage import (
     box_corners,
     entry,
     letter,
-    outcome,
     scene_entries,
+    site_entry,
     sites,
 )
 
 STILL_DPI = 160
-# Ways of up to seven robots are told apart by colour, of more by their numbers.
-WAYS = ("#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#000000", "#8c6d46", "#7a5fb0")
+# Ways of up to twelve robots are told apart by colour, of more by their numbers.
+WAYS = (
+    *("#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#000000", "#8c6d46"),
+    *("#7a5fb0", "#999933", "#882255", "#117733", "#44aa99", "#666666"),
+)
+CROWD = 10  # actors from which opponents' ways are only hinted at
 
 
-def draw_still(frames: Frames, path: Path) -> None:
+def draw_still(frames: Frames, path: Path, caption: str = "") -> None:
     """Writes a PNG of the whole episode; the file is complete or not there.
+
+    ``caption``: as of Stage.
 
     Raises:
         OSError: the file cannot be written.
     """
-    stage = Stage(frames, _legend(frames))
-    stage.clock.set_text(outcome(frames))
-    for patch in sites(frames.scene):
+    stage = Stage(frames, _legend(frames), caption)
+    for patch in sites(frames.scene, frames.sites_done[-1].tolist()):
         stage.ax.add_patch(patch)
     for index in reversed(range(len(frames.actors))):
         _draw_way(stage, frames, index)
@@ -60,15 +65,17 @@ def _draw_way(stage: Stage, frames: Frames, index: int) -> None:
     steps = int(alive.sum())  # the dead stay dead
     way = frames.positions_m[:steps, index]
     main = actor.side is Side.ROBOTS
+    hinted = not main and len(frames.actors) >= CROWD
     pieces = list(np.stack([way[:-1], way[1:]], axis=1))
+    faint, clear = (0.12, 0.35) if hinted else (0.35, 1.0)
     ax.add_collection(
         LineCollection(
             pieces, colors=colour, linewidths=1.8 if main else 1.0,
-            alpha=np.linspace(0.35, 1.0, max(1, len(pieces)))[: len(pieces)],
+            alpha=np.linspace(faint, clear, max(1, len(pieces)))[: len(pieces)],
             zorder=6 if main else 5, capstyle="round",
         )
     )  # fmt: skip
-    hit = way[1:][frames.hits[: steps - 1, index]]
+    hit = way[1:][frames.hits[: steps - 1, index] & (not hinted)]
     ax.plot(
         hit[:, 0], hit[:, 1], linestyle="none", marker="o", markersize=3.4 if main else 2.6,
         markerfacecolor="white", markeredgecolor=colour, markeredgewidth=1.0, zorder=7,
@@ -109,6 +116,11 @@ def _draw_ends(stage: Stage, frames: Frames, index: int, way: FloatArray) -> Non
         if np.linalg.norm(at - way[0]) < actor.radius_m:
             at += actor.radius_m
         ax.plot(*at, marker="x", markersize=8, markeredgewidth=2.4, color=colour, zorder=10)
+        if main:
+            ax.annotate(
+                letter(actor, index), tuple(at), (6, 4), textcoords="offset points",
+                fontsize=size, color=colour, weight="bold", zorder=10,
+            )  # fmt: skip
     elif np.linalg.norm(way[-1] - way[0]) > 0.2 * actor.radius_m:
         ax.add_patch(Circle(tuple(way[-1]), actor.radius_m, facecolor=colour, zorder=8))
         label = ax.text(
@@ -135,4 +147,7 @@ def _legend(frames: Frames) -> list[Any]:
         out.append(entry("was hit", **ring))
     if not frames.alive[-1].all():
         out.append(entry("died", marker="x", markersize=8, markeredgewidth=2.4, color=INK))
-    return out + scene_entries(frames)
+    out += scene_entries(frames)
+    if frames.sites_done[-1].any():
+        out.append(site_entry(frames.scene, done=True))
+    return out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -51,8 +52,8 @@ def check_out(out: Path) -> None:
     check_file_target("--out", out)
 
 
-def draw(frames: Frames | Pictures, out: Path, speed: float) -> None:
-    """Writes the episode to ``out``.
+def draw(frames: Frames | Pictures, out: Path, speed: float, caption: str) -> None:
+    """Writes the episode to ``out``; ``caption``: who acts, and what happens to whom.
 
     Raises:
         CliError: the file cannot be written.
@@ -64,11 +65,11 @@ def draw(frames: Frames | Pictures, out: Path, speed: float) -> None:
 
     try:
         if out.suffix not in STILLS:
-            write_video(frames, out, speed)
+            write_video(frames, out, speed, caption)
         elif isinstance(frames, Pictures):
             write_still(frames, out)
         else:
-            draw_still(frames, out)
+            draw_still(frames, out, caption)
     except OSError as error:
         raise CliError(not_written("--out", out, error)) from None
     console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
@@ -165,23 +166,31 @@ def render(
         parameters = mode_parameters(mode, param or [])
         target = load_target(team, scenario)
         condition = one_condition(target.robots, crash_rate, crashed, victims, mode, parameters)
-        frames = play_one(target, condition, episode or 0, evaluation_seed(seed))
+        frames = play_one(target, condition, episode or 0, seed)
         crash = condition.crash.model_dump(mode="json")
         which = {"team": team, "condition": condition.name, "crash": crash, "seed": seed}
     with written_first(json, {**outcome(frames), **which, "file": str(out)}):
         tell(frames)
-        draw(frames, out, speed)
+        draw(frames, out, speed, caption_of(which))
 
 
 def play_one(target: Target, condition: Condition, episode: int, seed: int) -> Frames | Pictures:
     """An episode that evaluate plays too, as what can be drawn of it."""
+    key = evaluation_seed(seed)
     tell_note(target.note)
     source = target.source
     source = source if isinstance(source, ScenarioSource) else read_scenario(source)
     if source.foreign() is not None:
-        return record_pictures(target.team, source, condition, episode, seed)
-    (frames,) = record(target.team, source, condition, range(episode, episode + 1), seed)
-    return frames
+        return replace(record_pictures(target.team, source, condition, episode, key), seed=seed)
+    (frames,) = record(target.team, source, condition, range(episode, episode + 1), key)
+    return replace(frames, seed=seed)
+
+
+def caption_of(which: Mapping[str, Any]) -> str:
+    """'runs/mine: robot_2 random', of a recording its name and the modes in it."""
+    if "team" in which:
+        return f"{which['team']}: {which['condition']}"
+    return ": ".join([which["recording"], ", ".join(which["modes"]) or "crash-free"])
 
 
 def refuse_options_of_a_team(context: typer.Context) -> None:
