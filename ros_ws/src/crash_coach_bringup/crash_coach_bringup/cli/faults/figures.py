@@ -10,6 +10,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from crash_coach_bringup.cli.figure_style import COLOURS, INK
+from crash_coach_pkg.coach.expectations import Outcome
 from crash_coach_pkg.faults import is_observation_mode
 from policy_pkg.report.verdict import FaultRun
 from policy_pkg.statistics import wilson
@@ -91,8 +92,13 @@ def returns(run: FaultRun) -> Figure:
     return figure
 
 
+def _ended(outcome: Outcome) -> str:
+    done = "success" if outcome.success else "no success"
+    return f"{done} after {outcome.steps} steps"
+
+
 def timeline(run: FaultRun) -> Figure:
-    """Which fault was in force on which robot, in the first episode that had one."""
+    """Which fault was in force on which robot, in the first episode that had one, and its end."""
     effects = [row for row in run.faulted.effects if row.kind == "EFFECT"]
     episode = effects[0].episode if effects else run.faulted.episodes[0].episode
     (steps,) = (e.steps for e in run.faulted.episodes if e.episode == episode)
@@ -112,8 +118,12 @@ def timeline(run: FaultRun) -> Figure:
     ax.set_ylim(len(robots) - 0.5, -0.5)
     ax.set_xlim(0, max(1, steps))
     ax.set_xlabel("control step", color=INK)
-    nothing = "" if entries else ": no fault took effect"
-    ax.set_title(f"episode {episode}{nothing}", fontsize=10, color=INK)
+    (pair,) = (pair for pair in run.trials.pairs if pair.episode == episode)
+    nothing = "" if entries else "no fault took effect; "
+    text = f"episode {episode}: {nothing}{_ended(pair.faulted)}"
+    text += f"; crash-free {_ended(pair.crash_free)}"
+    ax.set_title(text, fontsize=10, color=INK)
+    ax.axvline(steps, color=FREE if pair.faulted.success else FAULTED, linewidth=2)
     if entries:
         ax.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
     return figure

@@ -23,7 +23,7 @@ from policy_pkg.report.finished_runs import Run, methods_of
 from policy_pkg.report.kept_evaluations import Result
 from policy_pkg.report.rows import ALL_MAPS, THRESHOLDS, Improvement, Profile, Row
 
-APART = 0.06  # between the methods' points at the same number of crashed robots
+BAND = 0.7  # of a number of crashed robots, shared by the methods
 
 
 def write(findings: Findings, runs: Sequence[Run], out: Path) -> list[Path]:
@@ -70,10 +70,16 @@ def resilience(rows: Sequence[Row], methods: Sequence[str]) -> Figure:
     for ax, name in zip(axes, maps, strict=True):
         for index, method in enumerate(methods):
             mine = [row for row in rows if (row.scenario, row.method) == (name, method)]
-            _draw_method(ax, mine, index, (index - (len(methods) - 1) / 2) * APART)
+            _draw_method(ax, mine, index, (index - (len(methods) - 1) / 2) * BAND / len(methods))
         ax.set_title(name, fontsize=11, color=INK)
         ax.set_ylim(-0.03, 1.03)
-        ax.set_xticks(sorted({row.crashed or 0 for row in rows}))
+        numbers = sorted({row.crashed or 0 for row in rows})
+        ax.set_xticks(numbers)
+        ax.grid(visible=False, axis="x")
+        # Bands: what lies beside each other in one belongs to the same number.
+        for k in numbers[::2]:
+            ax.axvspan(k - 0.5, k + 0.5, color="#f2f2f2", zorder=0)
+        ax.set_xlim(numbers[0] - 0.5, numbers[-1] + 0.5)
         ax.set_xlabel("crashed robots", color=INK)
         ax.set_ylabel("success rate", color=INK)
     handles = [
@@ -81,7 +87,7 @@ def resilience(rows: Sequence[Row], methods: Sequence[str]) -> Figure:
         for i, name in enumerate(methods)
     ]
     legend_above(figure, handles)
-    marks = {"large: mean of the seeds, small: each seed": any(len(r.seeds) > 1 for r in rows)}
+    marks = {"dots: mean of the seeds, dashes: each seed": any(len(r.seeds) > 1 for r in rows)}
     marks["bar: Wilson's 95 % interval of a single seed"] = any(len(r.seeds) == 1 for r in rows)
     text = "; ".join(text for text, there in marks.items() if there)
     figure.supxlabel(text, fontsize=8, color=INK)
@@ -93,11 +99,12 @@ def _draw_method(ax: Any, rows: Sequence[Row], index: int, shift: float) -> None
     ordered = sorted(rows, key=lambda row: row.crashed or 0)
     places = [(row.crashed or 0) + shift for row in ordered]
     means = [row.mean for row in ordered]
-    ax.plot(places, means, dash, color=colour, marker="o", markersize=7, linewidth=1.5, zorder=3)
+    ax.plot(places, means, dash, color=colour, linewidth=1.0, alpha=0.35, zorder=2)
+    ax.plot(places, means, "o", color=colour, markersize=7, zorder=3)
     for place, row in zip(places, ordered, strict=True):
         if len(row.seeds) > 1:
-            points = [place + 0.02] * len(row.success)
-            ax.plot(points, row.success, "o", color=colour, markersize=3, alpha=0.6, zorder=4)
+            points = [place] * len(row.success)
+            ax.plot(points, row.success, "_", color=colour, markersize=9, alpha=0.8, zorder=4)
         elif row.interval is not None:
             error = [[row.mean - row.interval.low], [row.interval.high - row.mean]]
             ax.errorbar(place, row.mean, error, color=colour, capsize=3, linewidth=1)

@@ -82,7 +82,10 @@ def percent(row: Row) -> str:
 
 
 def span(estimate: Estimate | None) -> str:
-    return NONE if estimate is None else f"{figure(estimate.low)}..{figure(estimate.high)}"
+    """'30.1..52.9'; an interval without width, of seeds that all score alike, is none."""
+    if estimate is None or figure(estimate.low) == figure(estimate.high):
+        return NONE
+    return f"{figure(estimate.low)}..{figure(estimate.high)}"
 
 
 def overview(rows: Sequence[Row]) -> list[tuple[str, list[str], list[list[str]]]]:
@@ -181,7 +184,8 @@ def _details(rows: Sequence[Row]) -> str:
     for row in rows:
         iqm = NONE
         if row.iqm is not None:
-            iqm = f"{figure(row.iqm.value)} ({span(row.iqm)})"
+            around = span(row.iqm)
+            iqm = figure(row.iqm.value) + ("" if around == NONE else f" ({around})")
         returns = f"{sum(row.returns) / len(row.returns):.2f}" if row.returns else NONE
         place = (row.scenario, row.condition, row.method, len(row.seeds))
         lines.append([*place, percent(row), span(row.interval), iqm, returns])
@@ -258,6 +262,7 @@ def notes(rows: Sequence[Row], runs: Sequence[Mapping[str, Any]]) -> list[str]:
         )
     if any(row.std == 0 for row in rows):
         out.append(
-            "Where all seeds score alike, their interval has no width: that is no certainty."
+            "Where all seeds score alike, their interval has no width and is left out: it would be "
+            "no certainty."
         )
     return list(dict.fromkeys(out))

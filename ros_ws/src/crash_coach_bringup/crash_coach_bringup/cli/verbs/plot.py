@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from crash_coach_bringup.cli.curves import (
@@ -29,6 +30,8 @@ from crash_coach_bringup.cli.output import (
     console,
     written_first,
 )
+from policy_pkg.report.finished_runs import read_text
+from policy_pkg.train.run_dir import METRICS, RUN
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -83,21 +86,36 @@ def draw_panel(ax: Any, key: str, groups: Sequence[Group], curves: Sequence[Curv
     ax.xaxis.set_major_formatter(EngFormatter(sep=""))
     if key in PROBABILITIES:
         ax.set_ylim(-0.03, 1.03)
-    missing = []
+    missing: list[str] = []
+    drawn: list[Curve] = []
     for index, (group, curve) in enumerate(zip(groups, curves, strict=True)):
         if curve is None:
             missing.append(group.label)
             continue
         colour, dash = style(index)
         x, y = curve.steps, curve.mean
-        ax.plot(x, y, dash, color=colour, linewidth=1.5, zorder=3)
+        under = sum(np.array_equal(y, other.mean) for other in drawn)
+        drawn.append(curve)
+        # Dashes over a curve that is the same leave both to be seen.
+        line: Any = dash if not under else (4.0 * under, (4, 4 * under + 4))
+        ax.plot(x, y, linestyle=line, color=colour, linewidth=1.5, zorder=3)
         if curve.low is not None:
             ax.fill_between(x, curve.low, curve.high, color=colour, alpha=0.2, linewidth=0)
         if not group.finished:
             ax.plot(x[-1:], y[-1:], "o", color=colour, markerfacecolor="white", zorder=4)
+    if key not in PROBABILITIES and drawn:
+        ax.set_ylim(*wide_enough(ax.get_ylim()))
     # In the title, where no curve can lie beneath it.
     absent = f"\nnot measured: {', '.join(missing)}" if missing else ""
     ax.set_title(TITLES[key] + absent, fontsize=11, color=INK)
+
+
+def wide_enough(limits: tuple[float, float]) -> tuple[float, float]:
+    """The limits of an axis, wider where a flat curve's last digits would fill it."""
+    low, high = limits
+    middle = (low + high) / 2
+    half = max((high - low) / 2, 0.05, 0.05 * abs(middle))
+    return middle - half, middle + half
 
 
 def legend(group: Group) -> str:
@@ -164,9 +182,16 @@ def _curve_json(curve: Curve, steps: str) -> dict[str, list[float] | None]:
     }
 
 
+def runs_in(given: Path) -> list[Path]:
+    """``given``, or the runs in it that have begun, if it is a folder of such."""
+    inside = [] if (given / RUN).is_file() else sorted(p.parent for p in given.glob(f"*/{RUN}"))
+    begun = [path for path in inside if read_text(path / METRICS) is not None]
+    return begun or [given]
+
+
 def plot(
     runs: Annotated[
-        list[Path] | None, typer.Argument(metavar="RUN", help="Run directories.")
+        list[Path] | None, typer.Argument(metavar="RUN", help="Runs, or folders of runs.")
     ] = None,
     out: Annotated[
         Path, typer.Option(metavar="FILE_STEM", help="Writes FILE_STEM.png and FILE_STEM.svg.")
@@ -178,7 +203,7 @@ def plot(
         raise CliError("no run to plot: name at least one run directory, such as runs/qmix-s0")
     check_json_target(json)
     files = targets(out)
-    groups = group_runs([load_run(path) for path in runs])
+    groups = group_runs([load_run(path) for given in runs for path in runs_in(given)])
     curves: list[Curves] = [
         {key: average(group, key) for key in group.runs[0].kind.curves} for group in groups
     ]
