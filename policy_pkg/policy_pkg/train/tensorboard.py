@@ -11,8 +11,6 @@ from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
-from policy_pkg.train.metrics import Value
-
 
 class TensorBoard:
     """Writes every number of a metrics line under its key.
@@ -28,7 +26,7 @@ class TensorBoard:
     def _event(self, step: int, **content: Any) -> Event:
         return Event(wall_time=time.time(), step=step, **content)
 
-    def write(self, line: Mapping[str, Value], step: int) -> None:
+    def write(self, line: Mapping[str, object], step: int) -> None:
         """Raises OSError where events could not be written."""
         for key, value in line.items():
             if isinstance(value, int | float) and key != "env_steps":
