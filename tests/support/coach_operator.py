@@ -59,12 +59,19 @@ class Operator:
         assert answer.successful or answer.reason, "refused without a reason"
         return "" if answer.successful else str(answer.reason)
 
-    def get(self, *names: str) -> list[object]:
+    def get(self, *names: str) -> Sequence[object]:
         values = self._result(self.parameters.get_parameters(list(names))).values
         return [parameter_value_to_python(value) for value in values]
 
-    def describe(self, names: Sequence[str]) -> list[Any]:
-        return list(self._result(self.parameters.describe_parameters(list(names))).descriptors)
+    def names(self) -> Sequence[str]:
+        return self._result(self.parameters.list_parameters([], 0)).result.names  # type: ignore[no-any-return]
+
+    def load(self, path: str) -> Sequence[Any]:
+        """What `ros2 param load` calls; a result for each parameter of the file."""
+        return self._result(self.parameters.load_parameter_file(path)).results  # type: ignore[no-any-return]
+
+    def describe(self, names: Sequence[str]) -> Sequence[Any]:
+        return tuple(self._result(self.parameters.describe_parameters(list(names))).descriptors)
 
     def clear(self) -> Trigger.Response:
         return self._result(self.clearing.call_async(Trigger.Request()))

@@ -38,6 +38,12 @@ class BlockRecord:
     decision: Decision
     new_rate: float  # alpha_{t+1}
 
+    def __str__(self) -> str:
+        return (
+            f"success rate {self.success_rate:.3f}, crash rate {self.rate:.4f} -> "
+            f"{self.new_rate:.4f} ({self.decision})"
+        )
+
 
 class Coach:
     """Plans crashes for a team.

@@ -7,8 +7,8 @@ modes; what a ROS parameter cannot say (null, an empty list) has a stated value 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
@@ -17,7 +17,11 @@ from crash_coach_common.contract import UserError
 from crash_coach_pkg.coach.config import FURTHEST_M, HIGHEST_RETURN, CoachConfig, TeamSpec
 from crash_coach_pkg.coach.draws import check_team
 from crash_coach_pkg.coach.live_coach import ControlSettings
-from crash_coach_pkg.coach.strategies import ADAPTIVE_ALPHA_MAX, CURRICULUM_ALPHA_MAX
+from crash_coach_pkg.coach.strategies import (
+    ADAPTIVE_ALPHA_MAX,
+    CURRICULUM_ALPHA_MAX,
+    strategy_names,
+)
 from crash_coach_pkg.faults import SYNONYMS, check_parameters, fault_mode, mode_names
 
 Value = bool | int | float | str | Sequence[str] | Sequence[float]
@@ -33,7 +37,10 @@ _NOT_IN_A_GRAPH = ("curriculum_fraction", "curriculum_delta", "crash_parameters"
 
 @dataclass(frozen=True)
 class ParameterSpec:
-    """``low`` and ``high`` are inclusive; None where there is no numeric range."""
+    """``low`` and ``high`` are inclusive; None where there is no numeric range.
+
+    ``choices``: of an enumerated one; empty: any value.
+    """
 
     name: str
     default: Value
@@ -41,6 +48,7 @@ class ParameterSpec:
     low: float | None = None
     high: float | None = None
     read_only: bool = False
+    choices: tuple[str, ...] = ()
 
 
 SPECIAL = {
@@ -138,10 +146,21 @@ def unit_of(field: FieldInfo) -> str:
 def _specs(model: type[BaseModel]) -> Iterator[ParameterSpec]:
     for name, field in model.model_fields.items():
         if name in SPECIAL:
-            yield SPECIAL[name]
+            yield replace(SPECIAL[name], choices=_choices(name, field))
         elif name not in _NOT_IN_A_GRAPH:
             low, high = _bounds(field)
-            yield ParameterSpec(name, field.default, str(field.description), low, high)
+            text = str(field.description)
+            choices = _choices(name, field)
+            yield ParameterSpec(name, field.default, text, low, high, choices=choices)
+
+
+def _choices(name: str, field: FieldInfo) -> tuple[str, ...]:
+    """What an enumerated parameter takes, with what other packages have installed."""
+    installed = {"crash_mode": (*mode_names(), *SYNONYMS), "strategy": strategy_names()}
+    if name in installed:
+        return installed[name]
+    literal = get_origin(field.annotation) is Literal
+    return tuple(str(word) for word in get_args(field.annotation)) if literal else ()
 
 
 def _bounds(field: FieldInfo) -> tuple[float | None, float | None]:
@@ -243,17 +262,20 @@ WHOM = ("victims", "crashed_exactly", "hazard_rate_hz", "near_radius_m", "return
 
 
 def check_change(settings: ControlSettings, changed: Sequence[str]) -> None:
-    """Raises UserError for a change that asks for victims while nobody can crash."""
+    """Raises UserError for a change that asks for victims while nobody can crash.
+
+    A call that says itself that nobody shall crash, as a file of all parameters may, means it.
+    """
     coach = settings.coach
     asked = [name for name in WHOM if name in changed]
     if not asked or not (coach.victims or coach.crashed_exactly > 0 or coach.triggered):
         return
-    if not settings.enabled:
+    if not settings.enabled and "enabled" not in changed:
         raise UserError(
             f"{asked[0]} would have no effect: enabled is false (as /coach/clear_all leaves it); "
             "set enabled to true first, or in the same call"
         )
-    if coach.strategy == "none" and not coach.victims:
+    if coach.strategy == "none" and not coach.victims and "strategy" not in changed:
         raise UserError(f"{asked[0]} would have no effect: strategy is none; set fixed, for one")
 
 

@@ -101,6 +101,14 @@ class FaultMode:
 class CommandFault(FaultMode, ABC, Generic[C]):
     """Changes or withholds commands."""
 
+    def begin(self, wanted: C | None) -> None:  # most modes need not know
+        """Called once, before the first ``apply``.
+
+        Args:
+            wanted: what the robot's controller wanted in the step before, whatever became of it;
+                None: nothing in this episode yet.
+        """
+
     @abstractmethod
     def apply(self, step: Step, command: C, last: C | None, tools: Tools[C]) -> C | None:
         """What is passed on instead of ``command``; None: nothing, the robot stays.

@@ -46,6 +46,7 @@ class _Stretch:
     fault: Fault
     since: int
     made: CommandFault[Any] | ObservationFault
+    begun: bool = False  # whether a command fault has seen a command
 
     def change(self, began: bool, step: int) -> Change:
         return Change(began, step, self.made.name, self.fault)
@@ -53,7 +54,8 @@ class _Stretch:
 
 class TeamFaults(Generic[C]):
     """Args: ``last``: what was last passed on to each robot in this episode, where a plan takes
-    over from another in mid-episode; likewise ``last_seen`` of its observations.
+    over from another in mid-episode; likewise ``last_seen`` of its observations, and ``wanted``:
+    what its controller last wanted.
 
     Raises:
         UserError: an unknown mode, or parameters that it does not take.
@@ -66,12 +68,14 @@ class TeamFaults(Generic[C]):
         first_step: int = 0,
         last: Sequence[C | None] | None = None,
         last_seen: Sequence[FloatArray | None] | None = None,
+        wanted: Sequence[C | None] | None = None,
     ) -> None:
         self.plan = plan
         self.last: list[C | None] = [None] * n_robots if last is None else list(last)
         self.last_seen: list[FloatArray | None] = (
             [None] * n_robots if last_seen is None else list(last_seen)
         )
+        self.wanted: list[C | None] = [None] * n_robots if wanted is None else list(wanted)
         for fault in plan.faults:
             check_parameters(fault.mode, dict(fault.parameters))
         # Whether what policies see must be kept: the arrays are the caller's buffers.
@@ -152,11 +156,15 @@ class TeamFaults(Generic[C]):
         """What ``robot`` gets in the step entered."""
         stretch = self._commands.get(robot)
         if stretch is None:
-            self.last[robot] = command
+            self.last[robot] = self.wanted[robot] = command
             seen = self._observations.get(robot)
             return Effect(_mode(seen), _entry(seen), command)
         made = stretch.made
         assert isinstance(made, CommandFault)
+        if not stretch.begun:
+            stretch.begun = True
+            made.begin(self.wanted[robot])
+        self.wanted[robot] = command
         passed = made.apply(self._step(robot), command, self.last[robot], tools)
         if passed is not None and "availability" in made.needs and not tools.usable(passed):
             passed = None

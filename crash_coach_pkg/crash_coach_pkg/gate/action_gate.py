@@ -200,7 +200,7 @@ class GateState:
         stream = self._commands[robot]
         events = stream.follow(term, step)
         if term is None or stream.team is None:
-            stream.passed = action
+            stream.passed = stream.wanted = action
             revision = book.revision if term is None else term.revision
             decision = Decision(command, "", 0, action, revision)
         else:
@@ -234,6 +234,7 @@ class GateState:
             self.untold[robot] += 1
         tools = ActionTools(None if seen is None else seen[1], command.worst)
         mode, entry, passed = team.command(robot, command.action, tools)
+        stream.wanted = command.action
         if passed is not None:
             stream.passed = passed
         applied = WITHHELD if passed is None else passed

@@ -81,6 +81,7 @@ class Relay:
         self._step = 0
         self._relayed_in = -1  # the newest step that a command was decided in
         self._last: list[bytes | None] = [None] * n_robots  # passed on
+        self._wanted: list[bytes | None] = [None] * n_robots  # by the controller
         self._term: Term | None = None
         self._team: TeamFaults[bytes] | None = None  # None: the term has no faults
         self._running: list[Change] = []
@@ -105,7 +106,7 @@ class Relay:
         outputs = self._advance(now_s)
         self._relayed_in = self._step
         if self._team is None or not self._team.mode(robot):
-            self._last[robot] = data
+            self._last[robot] = self._wanted[robot] = data
             outputs.append(Sent(robot, data))
         elif self._decided_in[robot] == self._step:
             self._waiting[robot] = data
@@ -158,8 +159,9 @@ class Relay:
             if term is not None:  # what came before will not be asked for again
                 self.book.terms = self.book.terms[self.book.terms.index(term) :]
             if term is not None and term.faulted:
-                self._team = TeamFaults(term.plan, self._n, term.first_step, self._last)
-                self._last = self._team.last
+                last, wanted = self._last, self._wanted
+                self._team = TeamFaults(term.plan, self._n, term.first_step, last, wanted=wanted)
+                self._last, self._wanted = self._team.last, self._team.wanted
         if self._team is not None and term is not None:
             for change in self._team.enter(self._step):
                 outputs.append(self._note(change, term))
@@ -179,7 +181,7 @@ class Relay:
         """A command that waited for this step, or whose fault has ended."""
         if self._team is None or not self._team.mode(robot):
             self._waiting[robot] = None
-            self._last[robot] = data
+            self._last[robot] = self._wanted[robot] = data
             return [Sent(robot, data)]
         if self._decided_in[robot] == self._step:
             return []

@@ -30,6 +30,8 @@ class RobotFaults:
         """Faults of this stream that are in force."""
         self.passed: int | None = None
         """The command last passed on in this episode."""
+        self.wanted: int | None = None
+        """The command that the policy last wanted in this episode."""
         self.seen: FloatArray | None = None
         """What the policy last saw in this episode."""
         self._n = n_robots
@@ -41,6 +43,7 @@ class RobotFaults:
     def begin(self) -> None:
         """A new episode."""
         self.running, self.passed, self.seen = [], None, None
+        self.wanted = None
         self._term = self.team = None
 
     def expire(self) -> None:
@@ -60,9 +63,11 @@ class RobotFaults:
         if self.robot in term.faulted:
             self._term = term
             passed: list[int | None] = [None] * self._n
+            wanted: list[int | None] = [None] * self._n
             seen: list[FloatArray | None] = [None] * self._n
             passed[self.robot], seen[self.robot] = self.passed, self.seen
-            self.team = TeamFaults(term.plan, self._n, term.first_step, passed, seen)
+            wanted[self.robot] = self.wanted
+            self.team = TeamFaults(term.plan, self._n, term.first_step, passed, seen, wanted)
         if not term.faulted:
             return []
         return [self._event(EventKind.CLEARED, step, fault, term) for fault in ended]

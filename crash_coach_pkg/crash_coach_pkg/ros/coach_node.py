@@ -27,7 +27,11 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from crash_coach_common.contract import UserError
-from crash_coach_common.ros.parameters import CheckedParameterService, refuse_undeclared
+from crash_coach_common.ros.parameters import (
+    CheckedParameterService,
+    choices_text,
+    refuse_undeclared,
+)
 from crash_coach_common.ros.run_node import SPIN_S, spin
 from crash_coach_pkg.coach.coach import Planner
 from crash_coach_pkg.coach.config import TeamSpec
@@ -174,7 +178,11 @@ def _from_ros(value: Any) -> Value:
 
 
 def _descriptor(spec: ParameterSpec) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(description=spec.description, read_only=spec.read_only)
+    descriptor = ParameterDescriptor(
+        description=spec.description,
+        additional_constraints=choices_text(spec.choices),
+        read_only=spec.read_only,
+    )
     if spec.low is None or spec.high is None:
         return descriptor
     if isinstance(spec.default, int):

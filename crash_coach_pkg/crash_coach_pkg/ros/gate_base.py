@@ -16,7 +16,11 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from crash_coach_common.contract import UserError
-from crash_coach_common.ros.parameters import CheckedParameterService, refuse_undeclared
+from crash_coach_common.ros.parameters import (
+    CheckedParameterService,
+    choices_text,
+    refuse_undeclared,
+)
 from crash_coach_common.ros.qos import EVENTS, PLAN
 from crash_coach_common.ros.run_node import TICK_S
 from crash_coach_pkg.gate.health import Decided, Report, RobotState, TeamHealth
@@ -109,9 +113,11 @@ class GateBase(Node):
 
     # --- for what is attached ---------------------------------------------------------------
 
-    def text(self, name: str, default: str, description: str) -> str:
+    def text(self, name: str, default: str, description: str, choices: Sequence[str] = ()) -> str:
         """Declares a read-only parameter. Raises UserError where it is empty."""
-        descriptor = ParameterDescriptor(description=description, read_only=True)
+        descriptor = ParameterDescriptor(
+            description=description, additional_constraints=choices_text(choices), read_only=True
+        )
         value: str = self.declare_parameter(name, default, descriptor).value
         if not value:
             raise UserError(f"parameter {name!r} of {self.get_name()} is empty")

@@ -214,6 +214,7 @@ def _choice(base: GateBase, name: str, values: tuple[str, ...]) -> str:
         _MATCH,
         f"Of the robots' command topics: {known}. match: what all publishers of the raw topic "
         "offer is asked for, and the usual (reliable, volatile) is offered to the robots.",
+        (_MATCH, *values),
     )
     if value not in (_MATCH, *values):
         raise UserError(f"parameter {name} = {value!r}; one of: {known}")

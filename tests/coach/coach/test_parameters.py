@@ -97,10 +97,9 @@ def test_a_wrong_configuration_is_refused_with_the_reason(
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"victims": ("robot_1",), "enabled": False}, "victims would have no effect: enabled"),
+        ({"enabled": False, "victims": ("robot_1",)}, None),  # as a file of all parameters says
         ({"victims": ("robot_1",), "strategy": "none"}, None),
-        ({"crashed_exactly": 1, "strategy": "none"}, "crashed_exactly .* strategy is none"),
-        ({"crashed_exactly": 1, "enabled": False}, "crashed_exactly would have no effect"),
+        ({"crashed_exactly": 1, "strategy": "none"}, None),
         ({"victims": ("none",), "enabled": False}, None),
         ({"victims": ("robot_1",), "enabled": True}, None),
     ],
@@ -111,6 +110,30 @@ def test_a_change_without_effect_is_refused(values: dict[str, Any], message: str
         return
     with pytest.raises(UserError, match=message):
         check_change(settings(**values), tuple(values))
+
+
+@pytest.mark.parametrize(
+    ("before", "change", "message"),
+    [
+        ({"enabled": False}, {"victims": ("robot_1",)}, "victims would have no effect: enabled"),
+        ({"enabled": False}, {"crashed_exactly": 1}, "crashed_exactly would have no effect"),
+        ({"strategy": "none"}, {"crashed_exactly": 1}, "crashed_exactly .* strategy is none"),
+    ],
+)
+def test_a_change_that_cannot_take_effect_is_refused(
+    before: dict[str, Any], change: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(UserError, match=message):
+        check_change(settings(**before, **change), tuple(change))
+
+
+def test_enumerated_parameters_list_their_choices() -> None:
+    choices = {spec.name: spec.choices for spec in parameter_specs() if spec.choices}
+    assert set(choices) == {"apply_at", "success_from", "crash_mode", "strategy", "cap_rule"}
+    assert choices["apply_at"] == ("next_episode", "next_step")
+    assert {"mute", "stay", "blind"} <= set(choices["crash_mode"])
+    for spec in parameter_specs():
+        assert not spec.choices or spec.default in spec.choices
 
 
 def test_the_chosen_modes_parameters_count() -> None:

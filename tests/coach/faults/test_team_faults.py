@@ -128,7 +128,7 @@ def test_a_fault_that_strikes_again_at_once_starts_from_new() -> None:
     assert told == [(0, True), (4, False), (4, True), (8, False), (8, True)]
 
 
-def test_a_plan_that_takes_over_knows_what_was_last_passed_on_and_seen() -> None:
+def test_a_plan_that_takes_over_knows_what_was_last_wanted_passed_on_and_seen() -> None:
     first: TeamFaults[int] = TeamFaults(CrashPlan(0, 1, 0, 0.0, 1, (Fault(0, "blind", 9),)), 1)
     buffer = np.zeros(2, np.float32)
     for step in range(4):
@@ -137,7 +137,8 @@ def test_a_plan_that_takes_over_knows_what_was_last_passed_on_and_seen() -> None
         first.observation(0, buffer)
         first.command(0, step, ALL)
     faults = (Fault(0, "freeze", 2), Fault(0, "stale", 4))
-    second = TeamFaults(CrashPlan(0, 2, 0, 0.0, 1, faults), 1, 4, first.last, first.last_seen)
+    plan = CrashPlan(0, 2, 0, 0.0, 1, faults)
+    second = TeamFaults(plan, 1, 4, first.last, first.last_seen, first.wanted)
     second.enter(4)
     buffer[:] = 4
     assert second.observation(0, buffer).tolist() == [3, 3]
@@ -151,3 +152,26 @@ def test_nothing_in_force_gives_the_caller_s_own_array_back() -> None:
     assert team.observation(0, features) is features
     assert tuple(team.command(0, 3, ALL)) == ("", 0, 3)
     assert team.last == [3]
+
+
+def test_freeze_after_another_fault_holds_what_was_wanted_not_what_that_made_of_it() -> None:
+    faults = (Fault(0, "random", 2, 3), Fault(0, "freeze", 5))
+    whole: TeamFaults[int] = TeamFaults(CrashPlan(0, 1, 0, 0.0, 1, faults), 1)
+    drawn = []
+    for step in range(8):
+        whole.enter(step)
+        passed = whole.command(0, step % ACTIONS, ALL).passed
+        if 2 <= step < 5:
+            drawn.append(passed)
+        if step >= 5:
+            assert passed == 4 % ACTIONS
+    assert drawn[-1] != 4 % ACTIONS  # otherwise this test would say nothing
+    # A plan that takes over in mid-episode knows it too.
+    first: TeamFaults[int] = TeamFaults(CrashPlan(0, 1, 0, 0.0, 1, (Fault(0, "random", 0),)), 1)
+    for step in range(5):
+        first.enter(step)
+        first.command(0, step % ACTIONS, ALL)
+    frozen = CrashPlan(0, 2, 0, 0.0, 1, (Fault(0, "freeze", 5),))
+    second = TeamFaults(frozen, 1, 5, first.last, first.last_seen, first.wanted)
+    second.enter(5)
+    assert second.command(0, 0, ALL).passed == 4 % ACTIONS

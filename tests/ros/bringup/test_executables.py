@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from ament_index_python.packages import get_package_share_directory
+from ament_index_python.packages import get_package_share_directory, get_packages_with_prefixes
 from crash_coach_interfaces.msg import CrashPlan, EpisodeState
 
 from crash_coach_bringup.ros.client import graph_client
@@ -81,6 +81,12 @@ def test_each_executable_runs_appears_in_the_graph_and_ends_on_sigint(
     assert {
         name: (child.returncode, said[name]) for name, child in children.items()
     } == dict.fromkeys(expected, (0, ""))
+
+
+@pytest.mark.skipif("rviz2" in get_packages_with_prefixes(), reason="RViz is installed here")
+def test_rviz_that_is_not_installed_is_refused_before_anything_starts(checkpoint: Path) -> None:
+    with pytest.raises(GraphError, match="rviz:=true, but package rviz2 is not installed"):
+        launch_nodes(checkpoint, rviz="true")
 
 
 def test_the_launch_file_uses_nothing_that_does_not_exist() -> None:

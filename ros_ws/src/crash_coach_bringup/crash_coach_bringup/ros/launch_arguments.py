@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast, get_args
 
+from ament_index_python.packages import get_packages_with_prefixes
+
 from crash_coach_bringup.ros.graph import GraphError, Layout, Mode, UpOptions
 
 MODES: tuple[str, ...] = get_args(Mode)
@@ -36,7 +38,14 @@ ARGUMENTS = (
 
 
 def options_from(values: Mapping[str, str]) -> UpOptions:
-    """The graph that the launch arguments ask for. Raises GraphError naming a wrong value."""
+    """The graph that the launch arguments ask for.
+
+    Raises:
+        GraphError: naming a wrong value, or RViz where it is asked for and not installed: before
+            anything is started.
+    """
+    if values["rviz"] == "true" and "rviz2" not in get_packages_with_prefixes():
+        raise GraphError("rviz:=true, but package rviz2 is not installed; leave it out, or install")
     return UpOptions(
         scenario=values["scenario"],
         checkpoint=Path(values["checkpoint"]),

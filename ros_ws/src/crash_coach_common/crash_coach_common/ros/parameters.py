@@ -7,13 +7,15 @@ parameter without a name. Here both are refused.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TypeVar
+from typing import Literal, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterDescriptor, ParameterType, SetParametersResult
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
 
 from crash_coach_common.contract import UserError
@@ -21,6 +23,8 @@ from crash_coach_common.strict_yaml import ConfigError, did_you_mean
 
 LAST_TYPE = ParameterType.PARAMETER_STRING_ARRAY
 _OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides")
+
+SKIPPED = "read-only, and it has this value already"
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -41,6 +45,18 @@ def refuse_undeclared(node: Node) -> None:
     refuse_unknown(node, sorted(node._parameters))
 
 
+def _choices_of(about: FieldInfo) -> tuple[str, ...]:
+    """The words that an enumerated field takes; empty for any other field."""
+    literal = get_origin(about.annotation) is Literal
+    return tuple(str(word) for word in get_args(about.annotation)) if literal else ()
+
+
+def choices_text(choices: Iterable[str]) -> str:
+    """A descriptor's additional constraints."""
+    listed = ", ".join(choices)
+    return f"one of: {listed}" if listed else ""
+
+
 def declare_model(node: Node, model: type[Model]) -> Model:
     """Declares every field of ``model`` on ``node``, read-only; returns what was set at the start.
 
@@ -51,7 +67,10 @@ def declare_model(node: Node, model: type[Model]) -> Model:
     for name, about in model.model_fields.items():
         # Typed by the model, which says more than a type mismatch in rclpy does.
         descriptor = ParameterDescriptor(
-            description=about.description, read_only=True, dynamic_typing=True
+            description=about.description,
+            additional_constraints=choices_text(_choices_of(about)),
+            read_only=True,
+            dynamic_typing=True,
         )
         value = node.declare_parameter(name, about.default, descriptor).value
         scalar = value is None or isinstance(value, str | int | float)
@@ -86,19 +105,47 @@ def require(node: Node, parameters: BaseModel, *names: str) -> None:
 
 
 class CheckedParameterService(ParameterService):
-    """For a node made with ``start_parameter_services=False``."""
+    """For a node made with ``start_parameter_services=False``.
+
+    Several parameters in one call of set_parameters, such as `ros2 param load` makes, are set
+    together where that is possible, so that their order does not matter; otherwise one by one, each
+    with its own result. What is read-only and has the given value already is left as it is.
+    """
 
     def _set_parameters_callback(
         self, request: SetParameters.Request, response: SetParameters.Response
     ) -> SetParameters.Response:
+        skipped = [p.name for p in request.parameters if self._is_so_already(p)]
+        wanted = [p for p in request.parameters if p.name not in skipped]
+        together = len(wanted) > 1 and _refusal(wanted) is None and self._set_together(wanted)
         for parameter in request.parameters:
             refusal = _refusal([parameter])
-            if refusal is None:
+            if parameter.name in skipped:
+                response.results.append(SetParametersResult(successful=True, reason=SKIPPED))
+            elif refusal is not None:
+                response.results.append(refusal)
+            elif together:
+                response.results.append(SetParametersResult(successful=True))
+            else:
                 one = SetParameters.Request(parameters=[parameter])
                 super()._set_parameters_callback(one, response)
-            else:
-                response.results.append(refusal)
         return response
+
+    def _set_together(self, parameters: list[ParameterMessage]) -> bool:
+        """Whether all could be set at once; otherwise nothing was."""
+        request = SetParametersAtomically.Request(parameters=parameters)
+        response = SetParametersAtomically.Response()
+        super()._set_parameters_atomically_callback(request, response)
+        return bool(response.result.successful)
+
+    def _is_so_already(self, parameter: ParameterMessage) -> bool:
+        node = self._get_node()
+        if _refusal([parameter]) is not None or not node.has_parameter(parameter.name):
+            return False
+        if not node.describe_parameter(parameter.name).read_only:
+            return False
+        given = Parameter.from_parameter_msg(parameter)
+        return bool(node.get_parameter(parameter.name).value == given.value)
 
     def _set_parameters_atomically_callback(
         self,
