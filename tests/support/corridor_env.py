@@ -25,6 +25,7 @@ class Corridor(ParallelEnv[str, Any, int]):
         self.possible_agents = ["slow-1", "quick-2"]
         self.agents: list[str] = []
         self._sizes = {"slow-1": 2, "quick-2": 3}
+        self.state_space = spaces.Box(0.0, float(max(length, max_steps)), (3,), np.float64)
         self._choices = dict(self._sizes)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
@@ -48,7 +49,7 @@ class Corridor(ParallelEnv[str, Any, int]):
         acting = self.agents
         for agent, action in actions.items():
             assert self._mask(agent)[action - STAY], (agent, action)
-            self.places[agent] += action - STAY
+            self.places[agent] = min(self.length, self.places[agent] + action - STAY)
         there = {agent: self.places[agent] >= self.length for agent in acting}
         late = self.steps >= self.max_steps
         rewards = {agent: 1.0 if there[agent] else -0.1 for agent in acting}

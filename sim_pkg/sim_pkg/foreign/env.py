@@ -50,7 +50,7 @@ class ForeignEnv:
         joined = len(agents) * max(agent.features for agent in agents)
         size = joined if state is None else len(state)
         self._config = config
-        self._spec = spec = make_spec(scenario, first, config, agents, size)
+        self._spec = spec = make_spec(scenario, first, config, agents, size, state is not None)
         b, n = n_arenas, spec.n_robots
         self._obs: FloatArray = np.zeros((b, n, spec.obs_size), dtype=np.float32)
         self._state: FloatArray = np.zeros((b, spec.state_size), dtype=np.float32)

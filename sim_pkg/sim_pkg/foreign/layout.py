@@ -71,9 +71,14 @@ def _agent(env: Any, environment: str, name: str) -> AgentLayout:
 
 
 def make_spec(
-    scenario: str, env: Any, config: PettingZooConfig, agents: Sequence[AgentLayout], state: int
+    scenario: str,
+    env: Any,
+    config: PettingZooConfig,
+    agents: Sequence[AgentLayout],
+    state: int,
+    stated: bool,
 ) -> EnvSpec:
-    """``state``: size of the state.
+    """``state``: size of the state; ``stated``: it is the environment's own.
 
     Raises:
         ConfigError: what EnvRules has to say is missing or does not fit the environment.
@@ -94,7 +99,7 @@ def make_spec(
         state_size=state,
         episode_limit=_episode_limit(env, config),
         dt_s=_step_s(env, config),
-        bounds=_bounds(agents),
+        bounds=_bounds(env, agents, stated),
         reports_success=config.success_return is not None or config.success_info is not None,
         reports_positions=False,
     )
@@ -162,13 +167,14 @@ def _step_s(env: Any, config: EnvRules) -> float:
     return 1.0 / fps if isinstance(fps, int | float) and fps > 0 else 1.0
 
 
-def _bounds(agents: Sequence[AgentLayout]) -> tuple[float, float]:
+def _bounds(env: Any, agents: Sequence[AgentLayout], stated: bool) -> tuple[float, float]:
     """Of all features; 0 is among them, because rows are padded."""
     low, high = 0.0, 1.0
-    for agent in agents:
-        if isinstance(agent.observation, spaces.Box):
-            low = min(low, float(agent.observation.low.min(initial=0.0)))
-            high = max(high, float(agent.observation.high.max(initial=0.0)))
-        elif not isinstance(agent.observation, spaces.Discrete | spaces.MultiBinary):
+    own = [getattr(env, "state_space", None)] if stated else []
+    for space in [*own, *(agent.observation for agent in agents)]:
+        if isinstance(space, spaces.Box):
+            low = min(low, float(space.low.min(initial=0.0)))
+            high = max(high, float(space.high.max(initial=0.0)))
+        elif not isinstance(space, spaces.Discrete | spaces.MultiBinary):
             return -np.inf, np.inf
     return low, high

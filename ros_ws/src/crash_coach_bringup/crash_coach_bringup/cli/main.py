@@ -18,6 +18,7 @@ from crash_coach_bringup.cli.terminal import degrade_characters
 from crash_coach_bringup.cli.verbs import (
     bags,
     calibrate,
+    check_scenario,
     collect,
     demo,
     doctor,
@@ -69,6 +70,7 @@ app.command("collect")(collect.collect)
 app.command("report")(report.report)
 app.command("render")(render.render)
 app.command("calibrate")(calibrate.calibrate)
+app.command("check-scenario")(check_scenario.check_scenario)
 
 
 def repeat_options(arguments: list[str]) -> list[str]:
