@@ -15,8 +15,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
+from crash_coach_bringup.cli.fitted_table import FittedConsole, FittedTable
 
 KEYS = ("name", "value", "unit", "reference", "ratio", "target", "ok")
 HERE = Path(__file__).parent
@@ -42,13 +41,13 @@ def main() -> int:
     # One thread per process, as everywhere; before a module loads a BLAS.
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = "1"
-    console = Console()
+    console = FittedConsole()
     rows: list[dict[str, Any]] = []
     for name in arguments.only or known:
         console.print(f"{name} ...")
         for row in importlib.import_module(f"benchmarks.{name}").rows():
             rows.append({key: row[key] for key in KEYS})
-    table = Table(title="make bench", title_justify="left")
+    table = FittedTable(title="make bench", title_justify="left")
     for key in KEYS:
         table.add_column(key, justify="left" if key in ("name", "unit") else "right")
     for row in rows:
