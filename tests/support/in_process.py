@@ -9,6 +9,7 @@ from typing import NamedTuple
 from unittest.mock import patch
 
 from crash_coach_bringup.cli.main import main
+from crash_coach_bringup.cli.output import console
 
 
 class Done(NamedTuple):
@@ -23,7 +24,8 @@ def typed(*arguments: str) -> Done:
     """What ``crash-coach`` would have done; a defect's exception is the test's."""
     out, err, code = io.StringIO(), io.StringIO(), 0
     argv = patch.object(sys, "argv", ["crash-coach", *arguments])
-    with argv, redirect_stdout(out), redirect_stderr(err):
+    wide = patch.object(console, "_width", 160)  # whatever $COLUMNS was when it was made
+    with argv, wide, redirect_stdout(out), redirect_stderr(err):
         try:
             main()
         except SystemExit as end:
