@@ -34,6 +34,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "corridor"
     done = typed("train", "buttons/qmix", "--out", str(out), "--seed", "1", "--set", *SETTINGS)
     assert done.returncode == 0, done.stderr
+    assert "1,200" in done.stdout  # steps, in a table
+    assert "RunSummary" not in done.stdout
     return out
 
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from crash_coach_bringup.cli.jobs import Job, run_jobs
-from crash_coach_bringup.cli.output import CliError, console
+from crash_coach_bringup.cli.output import CliError, console, table
 from policy_pkg.train.config import load_train_config
+
+if TYPE_CHECKING:
+    from policy_pkg.train.run import RunSummary
 
 
 def plan_jobs(
@@ -47,6 +50,23 @@ def train(
 ) -> None:
     """Trains a team. Several configurations or seeds run side by side, a process per core."""
     jobs = plan_jobs(config, out, override or [], seed or [], resume)
-    for job, summary in zip(jobs, run_jobs(jobs), strict=True):
-        console.print(f"{job.name}: {summary}")
+    show(jobs, run_jobs(jobs))
+    for job in jobs:
         console.print(f"  checkpoint: {job.out_dir}", soft_wrap=True)
+
+
+def show(jobs: list[Job], summaries: list[RunSummary]) -> None:
+    """What each run came to; success is that of its last evaluation block."""
+    columns = ["run", "steps", "episodes", "gradient steps", "success", "crash-free", "minutes"]
+    rows = table("Trained", columns)
+    for job, summary in zip(jobs, summaries, strict=True):
+        last = [summary.last_block.get(key) for key in ("success_rate", "success_crash_free")]
+        rows.add_row(
+            job.name,
+            f"{summary.steps:,}",
+            f"{summary.episodes:,}",
+            f"{summary.gradient_steps:,}",
+            *("–" if rate is None else f"{100 * float(rate):.1f} %" for rate in last),
+            f"{summary.wall_s / 60:.1f}",
+        )
+    console.print(rows)
