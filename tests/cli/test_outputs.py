@@ -21,8 +21,6 @@ from crash_coach_common import whole_output
 from crash_coach_common.whole_output import kind_of, write_whole
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
-from sim_pkg.render.film import write_video
-from sim_pkg.render.frames import Frames
 
 BEGINNINGS = (b"{", b"\x89PNG", b"\0\0\0\x20ftyp")
 
@@ -144,18 +142,6 @@ def test_what_failed_first_is_said_and_what_was_computed_is_printed(
     with failed, written_first(tmp_path / "result.json", {"a": 1}):
         print("what was computed")
     assert "what was computed" in capsys.readouterr().out
-
-
-def test_a_film_that_cannot_be_written_says_why(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with pytest.raises(OSError, match="is a directory"):
-        write_video(Frames.__new__(Frames), make_folder(tmp_path / "film.gif"))
-
-
-def make_folder(path: Path) -> Path:
-    path.mkdir()
-    return path
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "iso-8859-1"])

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from crash_coach_common.contract import UserError
 from crash_coach_common.plugins import load, place
+from crash_coach_common.strict_yaml import did_you_mean
 from crash_coach_pkg.faults.adversarial import Adversarial
 from crash_coach_pkg.faults.base import (
     CommandFault,
@@ -143,6 +144,11 @@ def check_parameters(mode: str, parameters: Mapping[str, float]) -> FaultParamet
         detail = error.errors()[0]
         name = ".".join(str(part) for part in detail["loc"])
         known = ", ".join(schema.model_fields) or "none"
+        if detail["type"] == "extra_forbidden":
+            hint = did_you_mean(name, schema.model_fields)
+            raise UserError(
+                f"crash mode {mode}: no parameter {name!r}{hint} (its parameters: {known})"
+            ) from None
         raise UserError(
             f"crash mode {mode}: parameter {name} = {detail['input']!r}: {detail['msg']} "
             f"(its parameters: {known})"

@@ -17,6 +17,12 @@ SCRIPTED = "scripted:"
 HELP = "Run directory (RUN@best: its best checkpoint), checkpoint directory, or scripted:NAME."
 
 
+def scripted_name(team: str | Path) -> str | None:
+    """NAME of ``scripted:NAME``; None for a trained team."""
+    text = str(team)
+    return text.removeprefix(SCRIPTED) if text.startswith(SCRIPTED) else None
+
+
 @dataclass(frozen=True)
 class Target:
     """A team, and the scenario and robots it plays with.
@@ -47,12 +53,13 @@ def load_target(name: str, scenario: str | None) -> Target:
         UserError: a scripted team without a scenario.
         ConfigError: unknown or wrong scenario.
     """
-    if not name.startswith(SCRIPTED):
+    scripted = scripted_name(name)
+    if scripted is None:
         return _trained(name, scenario)
     if scenario is None:
         raise UserError(f"{name}: --scenario is needed; only a trained team knows its own")
     robots = make_any_env(scenario, 1).spec.robots
-    return Target(name, Scripted(name.removeprefix(SCRIPTED)), scenario, scenario, robots)
+    return Target(name, Scripted(scripted), scenario, scenario, robots)
 
 
 def _trained(name: str, scenario: str | None) -> Target:

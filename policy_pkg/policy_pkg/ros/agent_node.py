@@ -16,6 +16,8 @@ from crash_coach_common.ros.run_node import run, serving
 from policy_pkg.act import Exploration, greedy, least_valued
 from policy_pkg.agent import Agent
 from policy_pkg.checkpoint import load_policy
+from policy_pkg.play.scripted_agent import ScriptedAgent
+from policy_pkg.play.target import scripted_name
 from policy_pkg.ros.agent_params import PolicyParameters, TeamParameters, read_parameters
 from policy_pkg.ros.convert import bytes_from_answer, sensed_from_bytes
 from policy_pkg.ros.weights_link import Receive, WeightsLink
@@ -39,19 +41,7 @@ class AgentNode(Node):
         if parameters.live:
             self._link = WeightsLink(self, robots, self._act_for)
             return
-        bundle = load_policy(parameters.checkpoint)
-        agent: Agent[bytes] = Agent(
-            bundle.policy,
-            bundle.robots,
-            robots or bundle.robots,
-            bundle.obs_size,
-            bundle.n_actions,
-            greedy,
-            least_valued,
-        )
-        agent.exploration = Exploration(
-            parameters.epsilon, parameters.exploration_seed, len(bundle.robots)
-        )
+        agent = make_agent(parameters, robots)
         self._act_for(agent.robots, agent.receive)
 
     def _act_for(self, robots: tuple[str, ...], receive: Receive) -> None:
@@ -78,6 +68,36 @@ class AgentNode(Node):
             return
         for answer in answers:
             self._commands[answer.robot].publish(bytes_from_answer(answer))
+
+
+def make_agent(
+    parameters: TeamParameters, robots: tuple[str, ...]
+) -> Agent[bytes] | ScriptedAgent[bytes]:
+    """A trained team's agent or a scripted one's, for ``robots``; for none of them: for all.
+
+    Raises:
+        UserError: a checkpoint, scenario, scripted policy or robot that is not there.
+    """
+    seed = parameters.exploration_seed
+    scripted = scripted_name(parameters.checkpoint)
+    agent: Agent[bytes] | ScriptedAgent[bytes]
+    if scripted is not None:
+        agent = ScriptedAgent(scripted, parameters.scenario, robots, seed)
+        n_robots = agent.n_robots
+    else:
+        bundle = load_policy(parameters.checkpoint)
+        n_robots = len(bundle.robots)
+        agent = Agent(
+            bundle.policy,
+            bundle.robots,
+            robots or bundle.robots,
+            bundle.obs_size,
+            bundle.n_actions,
+            greedy,
+            least_valued,
+        )
+    agent.exploration = Exploration(parameters.epsilon, seed, n_robots)
+    return agent
 
 
 def spin(make_node: Callable[[], AgentNode]) -> int:

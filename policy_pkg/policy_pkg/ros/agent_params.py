@@ -7,6 +7,7 @@ from rclpy.node import Node
 
 from crash_coach_common.contract import UserError
 from crash_coach_common.ros.parameters import read_model, require
+from policy_pkg.play.target import scripted_name
 
 _WITHOUT_LIVE = ("checkpoint", "epsilon", "exploration_seed")
 
@@ -16,7 +17,10 @@ class TeamParameters(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
-    checkpoint: str = Field("", description="run directory, RUN@best or checkpoint; see live")
+    checkpoint: str = Field(
+        "", description="run directory, RUN@best, checkpoint or scripted:NAME; see live"
+    )
+    scenario: str = Field("", description="of a scripted team, which does not know its own")
     live: bool = Field(False, description="act on the weights of a trainer instead of a checkpoint")
     command_topic: str = Field(
         "command_raw", min_length=1, description="answers go to /<robot>/<this>"
@@ -35,7 +39,10 @@ class TeamParameters(BaseModel):
         "the best one; 1: a random team",
     )
     exploration_seed: int = Field(
-        0, ge=0, le=2**63 - 1, description="keys these with (episode, step, robot)"
+        0,
+        ge=0,
+        le=2**63 - 1,
+        description="keys these with (episode, step, robot), and what a scripted team draws",
     )
 
 
@@ -50,6 +57,8 @@ def read_parameters(node: Node, model: type[TeamParameters]) -> TeamParameters:
     parameters = read_model(node, model)
     if not parameters.live:
         require(node, parameters, "checkpoint")
+        if scripted_name(parameters.checkpoint) is not None:
+            require(node, parameters, "scenario")
     for name in _WITHOUT_LIVE if parameters.live else ():
         if getattr(parameters, name) != model.model_fields[name].default:
             raise UserError(f"parameter {name!r} of {node.get_name()} has no meaning with live")

@@ -28,6 +28,7 @@ from typing import Any
 from crash_coach_common.contract import UserError
 from crash_coach_common.locks import TakenError, held
 from crash_coach_common.strict_yaml import ConfigError
+from crash_coach_common.whole_output import write_whole
 from policy_pkg.checkpoint import CHECKPOINTS, PolicyBundle, list_checkpoints
 from policy_pkg.kernels import kernels
 from policy_pkg.learner import native
@@ -71,7 +72,9 @@ def prepare_run(
     described = out_dir / RUN
     if described.exists():
         if not resume:
-            raise RunError(f"{out_dir} already holds a run: resume it, or choose another directory")
+            raise RunError(
+                f"{out_dir} already holds a run: go on with --resume, or choose another directory"
+            )
         run = read_run(out_dir)
         check_same(run, config, out_dir)
         _check_same_data(run, data, out_dir)
@@ -83,22 +86,23 @@ def prepare_run(
         raise RunError(f"{out_dir} is not empty and holds no run: choose another directory")
     if out_dir.exists() and not out_dir.is_dir():
         raise RunError(f"{out_dir} is a file: choose another directory")
-    out_dir.mkdir(parents=True, exist_ok=True)
     about = describe_run(config, data)
-    if scenario is not None:
-        file = scenario.write(out_dir / SCENARIO).relative_to(out_dir)
-        about["scenario"] = {
-            "name": scenario.name,
-            "file": file.as_posix(),
-            "sha256": scenario.sha256,
-        }
-    _write_run(out_dir, about)
+    try:
+        out_dir.mkdir(parents=True, exist_ok=True)
+        if scenario is not None:
+            file = scenario.write(out_dir / SCENARIO).relative_to(out_dir)
+            about["scenario"] = {
+                "name": scenario.name,
+                "file": file.as_posix(),
+                "sha256": scenario.sha256,
+            }
+        _write_run(out_dir, about)
+    except OSError as error:
+        raise RunError(f"{out_dir} cannot be written: {error.strerror}") from error
 
 
 def _write_run(out_dir: Path, about: Mapping[str, Any]) -> None:
-    partial = out_dir / (RUN + ".partial")
-    partial.write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
-    partial.rename(out_dir / RUN)
+    write_whole(out_dir / RUN, (json.dumps(about, indent=1) + "\n").encode())
 
 
 def kept_scenario(out_dir: Path) -> ScenarioSource | None:

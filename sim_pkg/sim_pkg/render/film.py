@@ -6,6 +6,9 @@ change is drawn once; of every picture only the rest is drawn anew.
 
 from __future__ import annotations
 
+import errno
+import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Protocol
@@ -44,6 +47,7 @@ _GIF_COLOURS = 64
 GIF_SCALE = 0.6  # of an MP4's width and height
 LAST_S = 1.5  # how long the end is shown
 _TRAIL_S = 4.0
+_SPACE_BYTES = 1 << 20  # with less left a film failed for want of it
 _FADED = 0.25
 
 
@@ -91,12 +95,20 @@ def _write_mp4(film: Film, times: npt.NDArray[np.float64], path: Path) -> None:
     quality = ["-preset", "veryfast", "-crf", "20", "-movflags", "+faststart"]
     encoder = imageio_ffmpeg.write_frames(
         str(path), film.size, fps=MP4_FPS, codec="libx264", quality=None, macro_block_size=2,
-        output_params=[*quality, *same],
+        output_params=[*quality, *same], ffmpeg_log_level="quiet",
     )  # fmt: skip
     encoder.send(None)
-    for at in times:
-        encoder.send(film.picture(at))
-    encoder.close()
+    try:
+        for at in times:
+            encoder.send(film.picture(at))
+        encoder.close()
+        written, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
+    except (OSError, RuntimeError):  # with ffmpeg's command line, but without a reason
+        written = 0
+    if written != len(times):
+        full = shutil.disk_usage(path.parent).free < _SPACE_BYTES
+        reason = errno.ENOSPC if full else errno.EIO
+        raise OSError(reason, os.strerror(reason), str(path))
 
 
 def _write_gif(film: Film, times: npt.NDArray[np.float64], path: Path) -> None:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from crash_coach_bringup.cli import signals
-from crash_coach_bringup.cli.output import console
+from crash_coach_bringup.cli.output import console, surroundings
 from crash_coach_common.contract import UserError
 from policy_pkg.checkpoint import CHECKPOINTS, list_checkpoints
 
@@ -69,8 +69,8 @@ def _work(index: int, job: Job, parent: int, out: Queue[Message]) -> None:
         out.put(Message(index, "stopped", None))
     except UserError as error:
         out.put(Message(index, "failed", str(error)))
-    except Exception:  # noqa: BLE001 - a defect: its traceback belongs to the parent's output
-        out.put(Message(index, "failed", traceback.format_exc()))
+    except Exception as error:  # noqa: BLE001 - a defect's traceback belongs to the parent's output
+        out.put(Message(index, "failed", surroundings(error) or traceback.format_exc()))
     else:
         out.put(Message(index, "done", summary))
 

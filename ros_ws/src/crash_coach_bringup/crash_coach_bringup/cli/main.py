@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import signal
 import sys
@@ -13,6 +12,7 @@ import typer
 from crash_coach_bringup.cli import signals
 from crash_coach_bringup.cli.faults import verb as faults
 from crash_coach_bringup.cli.multi_value import expand
+from crash_coach_bringup.cli.output import surroundings
 from crash_coach_bringup.cli.report import verb as report
 from crash_coach_bringup.cli.terminal import degrade_characters
 from crash_coach_bringup.cli.verbs import (
@@ -36,12 +36,6 @@ from crash_coach_bringup.cli.verbs import (
 )
 from crash_coach_common.contract import UserError
 from crash_coach_console.command import console
-
-# An OSError with one of these is no defect of ours.
-SURROUNDINGS = frozenset({
-    errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBUSY,
-    errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.EMFILE, errno.ENFILE,
-})  # fmt: skip
 
 app = typer.Typer(
     name="crash-coach",
@@ -89,9 +83,10 @@ def main() -> None:
     except UserError as error:
         _fail(f"error: {error}")
     except OSError as error:
-        if error.errno not in SURROUNDINGS:
+        text = surroundings(error)
+        if text is None:
             raise
-        _fail(f"error: {error.filename or 'writing'}: {error.strerror}")
+        _fail(f"error: {text}")
     except signals.Terminated:
         print(signals.line(signal.SIGTERM), file=sys.stderr)  # noqa: T201
         raise

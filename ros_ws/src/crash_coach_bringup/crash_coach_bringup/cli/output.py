@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -14,6 +15,11 @@ from crash_coach_common.whole_output import check_output, write_whole
 from policy_pkg.statistics import Estimate
 
 console = FittedConsole()
+# An OSError with one of these is no defect of ours.
+SURROUNDINGS = frozenset({
+    errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBUSY,
+    errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.EMFILE, errno.ENFILE,
+})  # fmt: skip
 
 
 class CliError(UserError):
@@ -41,6 +47,13 @@ def write_file(option: str, path: Path, content: bytes) -> None:
 def not_written(option: str, path: Path, error: OSError) -> str:
     """The one line on an output that failed."""
     return f"{option} {path}: cannot be written: {error.strerror or error}"
+
+
+def surroundings(error: Exception) -> str | None:
+    """One line on an OSError that is a disk's, a folder's or a limit's; None for any other."""
+    if not isinstance(error, OSError) or error.errno not in SURROUNDINGS:
+        return None
+    return f"{error.filename}: {error.strerror}" if error.filename else str(error.strerror)
 
 
 @contextmanager

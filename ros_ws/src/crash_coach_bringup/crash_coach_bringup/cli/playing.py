@@ -15,7 +15,7 @@ from crash_coach_bringup.cli.output import (
     tell_note,
 )
 from policy_pkg.play.conditions import Condition
-from policy_pkg.play.evaluate import Evaluation, Scripted
+from policy_pkg.play.evaluate import Evaluation
 from policy_pkg.play.evaluate_processes import evaluate_on
 from policy_pkg.play.target import Target
 from policy_pkg.statistics import Estimate, difference
@@ -35,15 +35,13 @@ def play(
     """Each condition's evaluation, in processes of this machine or as a ROS graph.
 
     Raises:
-        CliError: a scripted team over ROS, or several graphs.
+        CliError: several graphs.
     """
     tell_note(target.note)
     if via is Via.core:
         return evaluate_on(processes, target.team, target.source, conditions, episodes, seed)
     if processes > 1:
         raise CliError(f"--processes {processes}: with --via ros one graph plays all episodes")
-    if isinstance(target.team, Scripted):
-        raise CliError(f"--via ros: {target.name} has no nodes; scripted teams play in the core")
     from crash_coach_bringup.ros.evaluation import evaluate_via_ros
 
     checkpoint, scenario = Path(target.name), target.file

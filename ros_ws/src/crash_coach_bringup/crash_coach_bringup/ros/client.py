@@ -13,6 +13,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 from crash_coach_bringup.ros.discovery import use_quick_discovery
+from crash_coach_bringup.ros.domain import check_domain
 from crash_coach_bringup.ros.namespaces import checked_namespace
 from crash_coach_common.ros.greet import SPIN_S, WaitError, greet
 
@@ -73,10 +74,14 @@ def graph_client(
     """A client on ``domain`` (None: the environment's), independent of rclpy's global state.
 
     ``namespace``: that relative names of topics, services and nodes are in.
+
+    Raises:
+        UserError: a domain or a namespace that does not exist.
     """
+    number = check_domain(domain)
     use_quick_discovery()
     context = Context()
-    context.init(args=[], domain_id=domain)
+    context.init(args=[], domain_id=number)
     try:
         node = Node(
             name,

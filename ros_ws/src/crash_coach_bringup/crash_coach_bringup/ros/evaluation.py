@@ -25,8 +25,10 @@ from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
 from crash_coach_pkg.coach.fault_scenario import ScenarioPlanner, load_fault_scenario
 from crash_coach_pkg.faults import unmet_needs
 from crash_coach_pkg.faults.action_tools import ACTION_OFFERS
+from crash_coach_pkg.faults.base import Need
 from policy_pkg.play.conditions import Condition
 from policy_pkg.play.evaluate import Evaluation
+from policy_pkg.play.target import scripted_name
 
 
 def evaluate_via_ros(
@@ -40,9 +42,10 @@ def evaluate_via_ros(
 ) -> Evaluation:
     """Plays episodes 0 .. ``episodes`` - 1 in lock-step on a ROS domain of its own.
 
-    ``condition``: crashes of a coach, or a fault scenario's file. Equal arguments give the results
-    of policy_pkg.play.evaluate.evaluate with effects, bit for bit. The nodes' logs go to
-    ``log_dir``; None: to a temporary folder that is kept after an error.
+    ``checkpoint``: also ``scripted:NAME``. ``condition``: crashes of a coach, or a fault scenario's
+    file. Equal arguments give the results of policy_pkg.play.evaluate.evaluate with effects, bit
+    for bit. The nodes' logs go to ``log_dir``; None: to a temporary folder that is kept after an
+    error.
 
     Raises:
         EvaluationError: a node died, a plan was refused, or other robots crashed than it says.
@@ -64,7 +67,7 @@ def evaluate_via_ros(
             log_dir=logs,
         )
         team = check_team(options)
-        name, planner = _planner(condition, team, seed)
+        name, planner = _planner(condition, team, seed, _offers(checkpoint))
         processes = graph_processes(options, team)
         with Supervisor(processes, logs, graph_environment(domain), throughput=True) as graph:
 
@@ -80,7 +83,13 @@ def evaluate_via_ros(
     return Evaluation(name, team.robots, seed, results, effects, drawn)
 
 
-def _planner(condition: Condition | Path, team: TeamSpec, seed: int) -> tuple[str, Planner]:
+def _offers(checkpoint: Path) -> frozenset[Need]:
+    return ACTION_OFFERS if scripted_name(checkpoint) is None else ACTION_OFFERS - {"worst"}
+
+
+def _planner(
+    condition: Condition | Path, team: TeamSpec, seed: int, offers: frozenset[Need]
+) -> tuple[str, Planner]:
     """The condition's name, and what the coach node is going to plan."""
     if isinstance(condition, Path):
         faults = load_fault_scenario(condition)
@@ -89,7 +98,7 @@ def _planner(condition: Condition | Path, team: TeamSpec, seed: int) -> tuple[st
         coach = Coach(condition.crash, team, seed)
     except ValueError as error:
         raise UserError(f"condition {condition.name!r}: {error}") from error
-    if reason := unmet_needs(condition.crash.crash_mode, ACTION_OFFERS):
+    if reason := unmet_needs(condition.crash.crash_mode, offers):
         raise UserError(f"condition {condition.name!r}: {reason}")
     return condition.name, coach
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from crash_coach_bringup.ros import discovery
+from crash_coach_bringup.ros.domain import check_domain
 from crash_coach_bringup.ros.namespaces import checked_namespace
 from crash_coach_bringup.ros.probe import find_executable
 from crash_coach_common.contract import UserError
@@ -18,14 +18,15 @@ from crash_coach_pkg.coach.config import CoachConfig, FaultConfig, TeamSpec
 from crash_coach_pkg.coach.fault_scenario import load_fault_scenario
 from crash_coach_pkg.faults import check_parameters, fault_mode, is_observation_mode
 from policy_pkg.checkpoint import load_policy
+from policy_pkg.play.target import scripted_name
 from sim_pkg.env import make_env
+from sim_pkg.scripted import make_scripted
 
 Mode = Literal["lockstep", "realtime"]
 Layout = Literal["nodes", "team", "single"]
 Value = bool | int | float | str | Sequence[str] | Sequence[float] | Sequence[int]
 
 LOST_STEPS = 3  # without a command, as the sim's own default
-DOMAIN_LIMIT = 232  # rmw: higher ids have no valid UDP ports
 
 
 class GraphError(UserError):
@@ -53,7 +54,7 @@ class UpOptions:
     """
 
     scenario: str
-    checkpoint: Path | None
+    checkpoint: Path | None  # or scripted:NAME
     mode: Mode = "lockstep"
     layout: Layout = "nodes"
     seed: int = 0
@@ -96,14 +97,10 @@ class Process:
 
 def domain_id(options: UpOptions) -> int:
     """The domain that the graph runs on. Raises GraphError for one that does not exist."""
-    text = os.environ.get("ROS_DOMAIN_ID", "") if options.domain is None else str(options.domain)
     try:
-        domain = int(text or "0")
-    except ValueError:
-        raise GraphError(f"ROS_DOMAIN_ID is {text!r}, not a number") from None
-    if not 0 <= domain <= DOMAIN_LIMIT:
-        raise GraphError(f"ROS domain {domain} is not in 0..{DOMAIN_LIMIT}")
-    return domain
+        return check_domain(options.domain)
+    except UserError as error:
+        raise GraphError(str(error)) from None
 
 
 def graph_environment(domain: int) -> dict[str, str]:
@@ -166,11 +163,17 @@ def check_team(options: UpOptions) -> TeamSpec:
 
     Raises:
         crash_coach_common.strict_yaml.ConfigError: no such scenario.
+        crash_coach_common.strict_yaml.ConfigError: no such scripted team.
         policy_pkg.checkpoint.CheckpointError: no usable checkpoint, or one of another team.
     """
-    spec = make_env(options.scenario, 1).spec
+    env = make_env(options.scenario, 1)
+    spec = env.spec
     if options.checkpoint is not None:
-        load_policy(options.checkpoint).check_spec(spec)
+        scripted = scripted_name(options.checkpoint)
+        if scripted is None:
+            load_policy(options.checkpoint).check_spec(spec)
+        else:
+            make_scripted(scripted, env)
     return TeamSpec.of(spec)
 
 
@@ -194,7 +197,10 @@ def graph_nodes(options: UpOptions, team: TeamSpec) -> list[Node]:
     if options.checkpoint is None:
         acting["live"] = True
     else:
-        acting["checkpoint"] = str(options.checkpoint.resolve())
+        if scripted_name(options.checkpoint) is None:
+            acting["checkpoint"] = str(options.checkpoint.resolve())
+        else:
+            acting |= {"checkpoint": str(options.checkpoint), "scenario": options.scenario}
         acting |= {"epsilon": float(options.epsilon), "exploration_seed": options.seed}
     relays = relays_observations(options)
     if relays:

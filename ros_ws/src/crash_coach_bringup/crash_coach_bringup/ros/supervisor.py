@@ -185,5 +185,5 @@ def watch(
             on_event(Event("died", e.name, e.describe()))
         if ended:
             return 1
-    on_event(Event("interrupted", "", "interrupted"))
+    on_event(Event("interrupted", "", "stopping every process"))
     return 130

@@ -19,6 +19,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from crash_coach_common.caches import settle_caches
 from crash_coach_common.contract import UserError
 
 SPIN_S = 0.1  # how soon a signal is noticed
@@ -37,6 +38,7 @@ def run(body: Callable[[list[int]], None], program: str | None = None) -> int:
 
     Returns the exit code: 1 after one line of error on stderr, otherwise 0.
     """
+    settle_caches(Path(__file__).parent)
     received: list[int] = []
 
     def note(number: int, frame: FrameType | None) -> None:

@@ -15,6 +15,7 @@ from typing import Annotated
 import typer
 
 from crash_coach_bringup.cli.output import check_json_target, console, table, written_first
+from crash_coach_common.caches import places
 from policy_pkg.kernels import SAME_EVERYWHERE, kernels
 
 LIBRARIES = ("numpy", "numba", "pymunk", "torch", "safetensors", "pydantic", "matplotlib")
@@ -64,6 +65,11 @@ def blas_kernels() -> Finding:
         )
     )
     return Finding("BLAS kernels", found == SAME_EVERYWHERE, found or "not OpenBLAS", hint)
+
+
+def caches() -> Finding:
+    kept = "; ".join(f"{what}: {where}" for what, where in places().items())
+    return Finding("caches and logs", True, kept)
 
 
 def library(name: str) -> Finding:
@@ -122,7 +128,7 @@ def dds() -> Finding:
 
 def examine() -> list[Finding]:
     """Every check; those that need ROS only where ROS was found."""
-    findings = [python_version(), compiler(), disk(), threads(), blas_kernels()]
+    findings = [python_version(), compiler(), disk(), threads(), blas_kernels(), caches()]
     findings += [library(name) for name in LIBRARIES]
     findings += [underlay(), interfaces()]
     need_ros: list[Callable[[], Finding]] = [executables, dds]

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from crash_coach_bringup.cli.options import Layout, LayoutOption, Mode, NamespaceOption
-from crash_coach_bringup.cli.output import CliError
+from crash_coach_bringup.cli.output import CliError, not_written
 from crash_coach_console.serve import PORT
 from policy_pkg.play.conditions import at_rate
+from policy_pkg.play.target import HELP
 
 if TYPE_CHECKING:
     from crash_coach_bringup.ros.supervisor import Event
@@ -38,9 +41,18 @@ def show(event: Event) -> None:
     typer.echo(f"up: {': '.join(words)}", err=event.kind == "died")
 
 
+@contextmanager
+def logs_at(folder: Path) -> Iterator[None]:
+    """Raises CliError where the body could not write its logs."""
+    try:
+        yield
+    except OSError as error:
+        raise CliError(not_written("--logs", folder, error)) from None
+
+
 def up(
     scenario: Annotated[str, typer.Argument(help="Scenario name or YAML file.")],
-    policy: Annotated[Path, typer.Option(help="Run directory, RUN@best, or checkpoint directory.")],
+    policy: Annotated[Path, typer.Option(help=HELP)],
     mode: Annotated[
         Mode, typer.Option(help="As fast as every robot answers, or by the clock.")
     ] = Mode.lockstep,
@@ -85,4 +97,5 @@ def up(
         log_dir=logs,
         namespace=namespace,
     )
-    raise typer.Exit(run_up(options, show, port if console else None))
+    with logs_at(logs):
+        raise typer.Exit(run_up(options, show, port if console else None))
