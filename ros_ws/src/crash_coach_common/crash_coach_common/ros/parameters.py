@@ -15,7 +15,6 @@ from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterDescriptor, ParameterType, SetParametersResult
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
 
 from crash_coach_common.contract import UserError
@@ -23,8 +22,6 @@ from crash_coach_common.strict_yaml import ConfigError, did_you_mean
 
 LAST_TYPE = ParameterType.PARAMETER_STRING_ARRAY
 _OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides")
-
-SKIPPED = "read-only, and it has this value already"
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -109,22 +106,19 @@ class CheckedParameterService(ParameterService):
 
     Several parameters in one call of set_parameters, such as `ros2 param load` makes, are set
     together where that is possible, so that their order does not matter; otherwise one by one, each
-    with its own result. What is read-only and has the given value already is left as it is.
+    with its own result. What is read-only is left as it is, and does not keep the others from it.
     """
 
     def _set_parameters_callback(
         self, request: SetParameters.Request, response: SetParameters.Response
     ) -> SetParameters.Response:
-        skipped = [p.name for p in request.parameters if self._is_so_already(p)]
-        wanted = [p for p in request.parameters if p.name not in skipped]
+        wanted = [p for p in request.parameters if not self._read_only(p.name)]
         together = len(wanted) > 1 and _refusal(wanted) is None and self._set_together(wanted)
         for parameter in request.parameters:
             refusal = _refusal([parameter])
-            if parameter.name in skipped:
-                response.results.append(SetParametersResult(successful=True, reason=SKIPPED))
-            elif refusal is not None:
+            if refusal is not None:
                 response.results.append(refusal)
-            elif together:
+            elif together and not self._read_only(parameter.name):
                 response.results.append(SetParametersResult(successful=True))
             else:
                 one = SetParameters.Request(parameters=[parameter])
@@ -138,14 +132,9 @@ class CheckedParameterService(ParameterService):
         super()._set_parameters_atomically_callback(request, response)
         return bool(response.result.successful)
 
-    def _is_so_already(self, parameter: ParameterMessage) -> bool:
+    def _read_only(self, name: str) -> bool:
         node = self._get_node()
-        if _refusal([parameter]) is not None or not node.has_parameter(parameter.name):
-            return False
-        if not node.describe_parameter(parameter.name).read_only:
-            return False
-        given = Parameter.from_parameter_msg(parameter)
-        return bool(node.get_parameter(parameter.name).value == given.value)
+        return node.has_parameter(name) and bool(node.describe_parameter(name).read_only)
 
     def _set_parameters_atomically_callback(
         self,
