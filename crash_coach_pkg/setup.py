@@ -12,6 +12,7 @@ setup(
     packages=[
         "crash_coach_pkg",
         "crash_coach_pkg.coach",
+        "crash_coach_pkg.coach.strategies",
         "crash_coach_pkg.faults",
         "crash_coach_pkg.gate",
         "crash_coach_pkg.ros",

@@ -73,7 +73,7 @@ def act(index: int, observation: Any) -> int:
 
 
 def main() -> None:
-    coach = {"strategy": "adaptive", "beta": 0.5, "rho": 0.3, "crash_mode": "mute"}
+    coach = {"strategy": "adaptive", "adaptive": {"beta": 0.5, "rho": 0.3}}
     env = CrashWrapper(Meeting(), coach, stay_action=STAY, seed=1)
     view = MultiAgentView(env, stay_action=STAY, episode_limit=15)
     steps = 0
@@ -88,7 +88,7 @@ def main() -> None:
                 observations, _, terminated, truncated, _ = view.step(chosen)
                 over, steps = terminated or truncated, steps + 1
             successes += terminated
-            env.end_episode(env_steps=steps)
+            env.end_episode(bool(terminated), env_steps=steps)
         record = env.end_block(successes / BLOCK_EPISODES, env_steps=steps)
         print(
             f"block {block}: success {record.success_rate:.2f} at crash rate {record.rate:.2f}, "

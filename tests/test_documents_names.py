@@ -18,7 +18,14 @@ PACKAGES = {
 }
 FILES = ("md", "json", "jsonl", "yaml", "xml", "toml", "lock", "sh", "gz", "png", "logs")
 # Of other projects, of runs' folders, or made of parts.
-ELSEWHERE = {"pymunk.batch", "my_faults/hiccup.py", "best/", "return_1_crashed", "robot_n"}
+ELSEWHERE = {
+    "pymunk.batch",
+    "my_faults/hiccup.py",
+    "my_strategies/weakest.py",
+    "best/",
+    "return_1_crashed",
+    "robot_n",
+}
 SOURCES = ("*.py", "*.yaml", "*.msg", "*.xml", "*.js", "*.toml", "Makefile")
 
 Names = dict[str, set[str]]

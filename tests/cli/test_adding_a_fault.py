@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-import configparser
-import io
 import json
-import os
 import re
-import shlex
-import subprocess
-import tomllib
 from pathlib import Path
 
 import pytest
-
-from crash_coach_bringup.ros.probe import find_executable
+from page_package import crash_coach, install
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs/adding_a_fault.md").read_text()
 
@@ -25,40 +18,15 @@ def block(language: str) -> str:
     return str(found)
 
 
-def install(folder: Path, project: str) -> None:
-    """What installing the project leaves: its modules, and what its metadata says."""
+def installed(folder: Path, project: str) -> Path:
     (path,) = re.findall(r"The mode, `(\S+\.py)`", PAGE)
-    module = folder / path
-    module.parent.mkdir(parents=True)
-    module.with_name("__init__.py").touch()
-    module.write_text(block("python"))
-    settings = tomllib.loads(project)["project"]
-    info = folder / f"{settings['name'].replace('-', '_')}-{settings['version']}.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(
-        f"Metadata-Version: 2.1\nName: {settings['name']}\nVersion: {settings['version']}\n"
-    )
-    points = configparser.ConfigParser()
-    points.read_dict(settings["entry-points"])
-    text = io.StringIO()
-    points.write(text)
-    (info / "entry_points.txt").write_text(text.getvalue())
-
-
-def crash_coach(folder: Path, line: str, *more: str) -> subprocess.CompletedProcess[str]:
-    """Types the page's command where the package in ``folder`` is installed."""
-    program, *arguments = shlex.split(line)
-    command = [str(find_executable("crash_coach_bringup", program)), *arguments, *more]
-    paths = [str(folder), os.environ.get("PYTHONPATH", "")]
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
-    return subprocess.run(command, capture_output=True, text=True, timeout=90, env=env)
+    install(folder, path, block("python"), project)
+    return folder
 
 
 @pytest.fixture(scope="module")
 def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("site")
-    install(folder, block("toml"))
-    return folder
+    return installed(tmp_path_factory.mktemp("site"), block("toml"))
 
 
 def hash_of(folder: Path, line: str, out: Path) -> str:
@@ -99,8 +67,8 @@ def test_without_the_package_the_mode_is_unknown(tmp_path: Path) -> None:
     ],
 )
 def test_a_broken_entry_point_is_named(tmp_path: Path, old: str, new: str, text: str) -> None:
-    install(tmp_path / "site", block("toml").replace(old, new))
-    done = crash_coach(tmp_path / "site", block("bash").strip())
+    site = installed(tmp_path / "site", block("toml").replace(old, new))
+    done = crash_coach(site, block("bash").strip())
     assert done.returncode != 0
     said = " ".join(done.stderr.split())
     assert "entry point hiccup" in said

@@ -111,13 +111,15 @@ def test_every_mode_plays_and_keeps_the_masks(mode: str) -> None:
 
 def test_the_coach_hears_of_episodes_and_blocks() -> None:
     coach = Coach(
-        CoachConfig(strategy="adaptive", beta=0.5, rho=0.5), TeamSpec(("slow_1", "quick_2")), 0
+        CoachConfig(strategy="adaptive", adaptive={"beta": 0.5, "rho": 0.5}),
+        TeamSpec(("slow_1", "quick_2")),
+        0,
     )
     training = CrashWrapper(Corridor(), coach, stay_action=1)
     testing = CrashWrapper(Corridor(), coach, stay_action=1)
     for episode in range(4):
         training.reset(seed=episode)
-        training.end_episode(env_steps=20 * (episode + 1), total_steps=1000)
+        training.end_episode(True, env_steps=20 * (episode + 1), total_steps=1000)
     record = training.end_block(0.9, env_steps=80, total_steps=1000)
     assert (record.rate, record.new_rate, record.episodes) == (0.0, 0.5, 4)
     assert testing.coach.rate == 0.5

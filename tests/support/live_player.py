@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from crash_coach_pkg.coach.coach import Coach
 from crash_coach_pkg.coach.config import TeamSpec
-from crash_coach_pkg.coach.strategies import Progress
+from crash_coach_pkg.coach.strategies.base import Progress
 from crash_coach_pkg.plan import CrashPlan
 from policy_pkg.agent import Sensed
 from policy_pkg.bags.dataset import RecordedEpisode

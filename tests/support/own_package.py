@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
+from crash_coach_pkg.coach.strategies.by_rate import MovingRate
 from crash_coach_pkg.faults.base import CommandFault, FaultParameters
 from sim_pkg.scenarios.base import Kind
 from sim_pkg.scenarios.buttons import Buttons, ButtonsConfig
@@ -33,18 +34,15 @@ class Patrol(Buttons):
 KIND = Kind(PatrolConfig, Patrol)
 
 
-class Steady:
+class Steady(MovingRate):
     """A rate that follows the number of episodes."""
 
-    initial_rate = 0.25
-    needs_success = False
+    name = "steady"
+    summary = "A quarter crashes in the first episode, then half."
+    _rate = 0.25
 
-    def next_rate(self, rate, success_rate, progress):
-        return 0.5 if progress.episodes else 0.25
-
-
-def steady(config):
-    return Steady()
+    def episode_over(self, over):
+        self._rate = 0.5
 
 
 class LimpParameters(FaultParameters):
@@ -76,7 +74,7 @@ POINTS = """
 patrol = own:KIND
 
 [crash_coach.strategies]
-steady = own:steady
+steady = own:Steady
 
 [crash_coach.faults]
 limp = own:Limp

@@ -17,7 +17,7 @@ SMALL = {
     "checkpoint_interval_steps": 300,
     "tensorboard": False,
     "learner": {"hidden": 16, "mixing_hidden": 8, "hypernet_hidden": 8},
-    "coach": {"strategy": "adaptive", "rho": 0.2, "beta": 0.0},
+    "coach": {"strategy": "adaptive", "adaptive": {"rho": 0.2, "beta": 0.0}},
 }
 
 

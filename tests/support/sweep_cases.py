@@ -32,7 +32,11 @@ TINY: dict[str, Any] = {
     "seeds": [0],
     "methods": {
         "qmix": {"coach.strategy": "none"},
-        "adaptive": {"coach.strategy": "adaptive", "coach.beta": 0.0, "coach.rho": 0.3},
+        "adaptive": {
+            "coach.strategy": "adaptive",
+            "coach.adaptive.beta": 0.0,
+            "coach.adaptive.rho": 0.3,
+        },
     },
 }
 

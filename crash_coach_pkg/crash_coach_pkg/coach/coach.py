@@ -1,4 +1,4 @@
-"""The coach: keeps the crash rate, plans each episode's crashes, records evaluation blocks."""
+"""The coach: plans each episode's crashes with its strategy, which it tells how episodes went."""
 
 from __future__ import annotations
 
@@ -7,14 +7,21 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from crash_coach_common.contract import BoolArray, UserError
+from crash_coach_common.contract import BoolArray, EnvSpec, UserError
 from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
 from crash_coach_pkg.coach.draws import among, check_team, draw_faults, draw_victims, most_crashed
-from crash_coach_pkg.coach.strategies import Progress, make_strategy
-from crash_coach_pkg.coach.victims import crash_cap, draw_mask, episode_rng
+from crash_coach_pkg.coach.strategies import find_strategy, make_strategy, strategy_names
+from crash_coach_pkg.coach.strategies.base import (
+    BlockOver,
+    Candidates,
+    Draws,
+    EpisodeOver,
+    Progress,
+    State,
+)
+from crash_coach_pkg.coach.victims import episode_rng
 from crash_coach_pkg.plan import CrashPlan
 
-JsonScalar = int | float
 Decision = Literal["raise", "lower", "keep"]
 
 
@@ -65,11 +72,21 @@ class Coach:
         self._team = team
         self._candidates = team.of_role(config.victim_role)
         self._seed = seed
-        self._strategy = make_strategy(config)
-        self._rate = self._strategy.initial_rate
+        self._strategy = make_strategy(config.strategy, config.settings, self._whom())
         self._revision = 0
         self._episodes = 0
         self._crashed = 0
+
+    def _whom(self) -> Candidates:
+        config, n = self._config, len(self._candidates)
+        return Candidates(
+            n=n,
+            most=min(n, most_crashed(config, self._team.n)),
+            triggered=config.triggered,
+            crash_rate=config.crash_rate,
+            resample=config.resample,
+            cap_rule=config.cap_rule,
+        )
 
     @property
     def config(self) -> CoachConfig:
@@ -82,128 +99,150 @@ class Coach:
     @property
     def rate(self) -> float:
         """The nominal crash rate alpha in force."""
-        return self._rate
+        return self._strategy.rate
 
     def reconfigured(self, config: CoachConfig, seed: int) -> Coach:
-        """A coach with other settings that goes on from this one's rate.
-
-        Another strategy, or another rate to start from (fixed), starts at its own; alpha_max
-        holds at once. The counts of the realised crash fraction start again.
+        """A coach with other settings; a strategy that stays the same one goes on from its state.
+        The counts of the realised crash fraction start again.
 
         Raises:
             UserError: as the constructor.
         """
         coach = Coach(config, self._team, seed)
         coach._revision = self._revision + 1
-        same = config.strategy == self._config.strategy
-        if same and coach._rate == self._strategy.initial_rate:
-            coach._rate = coach._below_ceiling(self._rate)
+        if type(coach._strategy) is type(self._strategy):
+            coach._strategy.continue_from(self._strategy)
         return coach
 
-    def _below_ceiling(self, rate: float) -> float:
-        """A rate that was in force before; alpha_max does not concern strategy ``fixed``."""
-        ceiling = self._config.alpha_max
-        constant = self._config.strategy in ("none", "fixed")
-        return rate if constant or ceiling is None else min(rate, ceiling)
-
-    @property
-    def needs_success(self) -> bool:
-        """Whether the strategy reads success rates: refuse environments that report none."""
-        return self._strategy.needs_success
+    def check_scenario(self, spec: EnvSpec) -> None:
+        """Raises UserError where the scenario does not report what the strategy reads."""
+        if not self._strategy.needs_success or spec.reports_success:
+            return
+        others = (name for name in strategy_names() if not find_strategy(name).needs_success)
+        raise UserError(
+            f"scenario {spec.scenario!r} reports no success, which coach.strategy = "
+            f"{self._config.strategy!r} needs; use one of: {', '.join(others)}"
+        )
 
     @property
     def cap(self) -> int:
-        """Most robots that a draw at the present rate may crash."""
-        c, n = self._config, len(self._candidates)
-        limit = most_crashed(c, self._team.n)
-        return crash_cap(c.cap_rule, n, self._rate, limit, c.resample)
+        """Most robots that the strategy crashes together at present."""
+        return self._strategy.cap
 
     def plan(self, episode: int) -> CrashPlan:
-        """The crashes of ``episode``: the same for the same (config, rate, seed, episode)."""
-        mask, cap = self._mask(episode)
-        faults = draw_faults(self._config, self._team, mask)
-        return CrashPlan(episode, self._revision, self._seed, self._rate, cap, faults)
+        """The crashes of ``episode``: the same for the same (config, state, seed, episode)."""
+        return self._planned(episode, self._seed)
 
-    def _mask(self, episode: int) -> tuple[BoolArray, int]:
+    def keyed(self, seed: int) -> Planner:
+        """Plans as this coach does at the time it is asked, with the draws of another seed."""
+        return _Keyed(self, seed)
+
+    def _planned(self, episode: int, seed: int) -> CrashPlan:
+        mask, cap = self._mask(episode, seed)
+        faults = draw_faults(self._config, self._team, mask)
+        return CrashPlan(episode, self._revision, seed, self.rate, cap, faults)
+
+    def _mask(self, episode: int, seed: int) -> tuple[BoolArray, int]:
         """(n,) victims, and how many may be faulted together."""
         config, n = self._config, self._team.n
-        if config.strategy == "none" and not config.victims:
+        if config.crashes_nobody:
             return np.zeros(n, dtype=np.bool_), 0
-        rng = episode_rng(self._seed, episode)
-        by_rate = not self._everybody and not config.victims and config.crashed_exactly < 0
-        if by_rate:
-            drawn = draw_mask(rng, len(self._candidates), self._rate, self.cap)
-            mask, cap = among(self._candidates, n, drawn), self.cap
-        else:
-            mask = draw_victims(config, self._team, rng)
+        if config.victims or config.crashed_exactly >= 0:
+            mask = draw_victims(config, self._team, episode_rng(seed, episode))
             cap = int(mask.sum())
+        else:
+            chosen = np.zeros(len(self._candidates), dtype=np.bool_)
+            chosen[list(self._chosen(episode, seed))] = True
+            mask, cap = among(self._candidates, n, chosen), self.cap
         return mask, most_crashed(config, n) if config.triggered else cap
 
-    @property
-    def _everybody(self) -> bool:
-        """Whether a hazard or condition chooses among all candidates, without a draw before it."""
-        config = self._config
-        return config.triggered and config.strategy == "fixed" and config.crash_rate == 0
+    def _chosen(self, episode: int, seed: int) -> tuple[int, ...]:
+        whom, chosen = self._strategy.candidates, self._strategy.plan(episode, Draws(seed))
+        limit = whom.n if whom.triggered else whom.most
+        distinct = len(set(chosen)) == len(chosen) and all(0 <= i < whom.n for i in chosen)
+        if not distinct or len(chosen) > limit:
+            raise ValueError(
+                f"strategy {self._config.strategy!r} crashes {list(chosen)} in episode {episode}: "
+                f"at most {limit} different ones of 0..{whom.n - 1} may crash"
+            )
+        return chosen
 
-    def count(self, plan: CrashPlan) -> None:
-        """Counts a training episode towards the realised crash fraction of the block."""
+    def finish(self, plan: CrashPlan, success: bool, progress: Progress) -> None:
+        """Tells the strategy of a training episode that is over, and counts it towards the realised
+        crash fraction of the block. ``progress`` counts this episode."""
+        robots = sorted({fault.robot for fault in plan.faults})
         self._episodes += 1
-        self._crashed += len({fault.robot for fault in plan.faults})
-
-    def advance(self, progress: Progress) -> None:
-        """Lets strategies that follow training progress move the rate."""
-        self._set_rate(self._strategy.next_rate(self._rate, None, progress))
+        self._crashed += len(robots)
+        crashed = tuple(i for i, robot in enumerate(self._candidates) if robot in robots)
+        if len(crashed) == len(robots):  # otherwise the plan is not of these candidates
+            before = self.rate
+            self._strategy.episode_over(EpisodeOver(crashed, success, progress))
+            self._moved(before)
 
     def resume(self, rate: float, progress: Progress) -> None:
         """Goes on from the ``rate`` that another coach had in force; a strategy that does not
         depend on the rate before (fixed, curriculum) keeps its own."""
-        self._set_rate(self._below_ceiling(self._strategy.next_rate(rate, None, progress)))
+        before = self.rate
+        self._strategy.take_over(rate, progress)
+        self._moved(before)
 
-    def record_block(self, success_rate: float, progress: Progress) -> BlockRecord:
-        """Ends an evaluation block with its success rate e_t and moves the rate.
+    def record_block(
+        self,
+        success_rate: float,
+        progress: Progress,
+        crash_free: float | None = None,
+        by_victim: tuple[float, ...] = (),
+    ) -> BlockRecord:
+        """Ends an evaluation block and tells the strategy, whose fields of BlockOver these are.
 
         Raises:
             ValueError: a success rate outside [0, 1].
         """
-        if not 0 <= success_rate <= 1:
-            raise ValueError(f"success rate {success_rate} is not in [0, 1]")
-        old, cap, episodes = self._rate, self.cap, self._episodes
+        for rate in (success_rate, *by_victim, *([] if crash_free is None else [crash_free])):
+            if not 0 <= rate <= 1:
+                raise ValueError(f"success rate {rate} is not in [0, 1]")
+        old, cap, episodes = self.rate, self.cap, self._episodes
         fraction = self._crashed / (episodes * len(self._candidates)) if episodes else None
-        self._set_rate(self._strategy.next_rate(old, success_rate, progress))
+        self._strategy.block_over(BlockOver(success_rate, progress, crash_free, by_victim))
+        self._moved(old)
         self._episodes = self._crashed = 0
-        decision: Decision = (
-            "raise" if self._rate > old else "lower" if self._rate < old else "keep"
-        )
-        return BlockRecord(old, cap, fraction, episodes, success_rate, decision, self._rate)
+        new = self.rate
+        decision: Decision = "raise" if new > old else "lower" if new < old else "keep"
+        return BlockRecord(old, cap, fraction, episodes, success_rate, decision, new)
 
-    def _set_rate(self, rate: float) -> None:
+    def _moved(self, before: float) -> None:
+        rate = self.rate
         if not 0 <= rate <= 1:
             raise ValueError(
-                f"strategy {self._config.strategy!r} returned crash rate {rate}, not in [0, 1]"
+                f"strategy {self._config.strategy!r} has crash rate {rate}, not in [0, 1]"
             )
-        if rate != self._rate:
-            self._rate = rate
-            self._revision += 1
+        self._revision += rate != before
 
-    def state_dict(self) -> dict[str, JsonScalar]:
+    def state_dict(self) -> State:
         """What a checkpoint needs to continue bit for bit; config and seed are not part of it."""
         return {
-            "rate": self._rate,
+            "strategy": self._strategy.state_dict(),
             "revision": self._revision,
             "episodes": self._episodes,
             "crashed": self._crashed,
         }
 
-    def load_state_dict(self, state: dict[str, JsonScalar]) -> None:
-        """Raises ValueError where keys are missing or left over, or the rate is out of range."""
+    def load_state_dict(self, state: State) -> None:
+        """Raises ValueError where keys are missing or left over, or the strategy's state is bad."""
         if set(state) != set(self.state_dict()):
             raise ValueError(
                 f"coach state has keys {sorted(state)}, expected {sorted(self.state_dict())}"
             )
-        rate = float(state["rate"])
-        if not 0 <= rate <= 1:
-            raise ValueError(f"coach state: rate {rate} is not in [0, 1]")
-        self._rate = rate
+        self._strategy.load_state_dict(state["strategy"])
         self._revision = int(state["revision"])
         self._episodes = int(state["episodes"])
         self._crashed = int(state["crashed"])
+
+
+@dataclass(frozen=True)
+class _Keyed:
+    coach: Coach
+    seed: int
+
+    def plan(self, episode: int) -> CrashPlan:
+        return self.coach._planned(episode, self.seed)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Self
 
 from pydantic import (
     BaseModel,
@@ -17,11 +18,18 @@ from pydantic import (
 )
 
 from crash_coach_common.contract import EnvSpec, UserError
-from crash_coach_pkg.coach.strategies import is_strategy, strategy_names
+from crash_coach_common.wrong_key import Misplaced
+from crash_coach_pkg.coach.strategies import (
+    check_settings,
+    find_strategy,
+    is_strategy,
+    strategy_names,
+)
+from crash_coach_pkg.coach.strategies.base import StrategySettings
+from crash_coach_pkg.coach.victims import CapRule
 from crash_coach_pkg.faults import check_parameters, fault_mode
 from crash_coach_pkg.plan import NEXT_STEP
 
-CapRule = Literal["ceil", "floor", "authors"]
 FURTHEST_M = 1e6
 HIGHEST_RETURN = 1e9
 HIGHEST_HAZARD_HZ = 1000.0
@@ -196,50 +204,24 @@ class CoachConfig(FaultConfig):
     """Who crashes, how often and how.
 
     Precedence of the victims: ``victims`` crash in every episode, under every strategy; strategy
-    ``none`` draws nobody; ``crashed_exactly`` draws that many in every episode; otherwise the crash
-    rate draws.
-    With a hazard or condition and a fixed rate of 0, every candidate is a victim.
+    ``none`` crashes nobody else; ``crashed_exactly`` draws that many in every episode; otherwise
+    the strategy plans. With a hazard or condition, these are whom it can strike.
+
+    Every other key is a strategy's name and holds its settings, ``adaptive: {beta: 0.7}``. Those of
+    the chosen one are ``settings``; the others' are checked, and left out: they count for nothing.
     """
+
+    model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
 
     strategy: str = Field(
         default="none",
-        description="How the crash rate moves: none, fixed, curriculum, adaptive, or own.",
+        description="Who crashes in which episode: a strategy of docs/strategies.md, or your own.",
     )
     crash_rate: float = Field(
         default=0.0,
         ge=0,
         le=1,
         description="Crash rate alpha of strategy fixed, per robot and episode.",
-    )
-    beta: float = Field(
-        default=0.75,
-        ge=0,
-        le=1,
-        description="Adaptive: success rate from which the crash rate rises.",
-    )
-    rho: float = Field(
-        default=0.01,
-        gt=0,
-        le=1,
-        description="Adaptive: share of the way moved per evaluation block.",
-    )
-    alpha_max: float | None = Field(
-        default=None,
-        ge=0,
-        le=1,
-        description="Highest crash rate; null: 0.1 for curriculum, 1.0 for adaptive.",
-    )
-    curriculum_fraction: float = Field(
-        default=0.5,
-        gt=0,
-        le=1,
-        description="Curriculum: part of training after which alpha_max is reached.",
-    )
-    curriculum_delta: float | None = Field(
-        default=None,
-        gt=0,
-        le=1,
-        description="Curriculum: increment per episode instead of curriculum_fraction; null: off.",
     )
     resample: bool = Field(
         default=True, description="Discard draws with more crashed robots than cap_rule allows."
@@ -250,13 +232,59 @@ class CoachConfig(FaultConfig):
         "authors (n - round(n (1 - a)), the authors' code).",
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _settings_of_strategies(cls, values: Any) -> Any:
+        if not isinstance(values, dict):
+            return values
+        own = {key: value for key, value in values.items() if key in cls.model_fields}
+        chosen = own.get("strategy", cls.model_fields["strategy"].default)
+        sections: dict[Any, Any] = {}
+        if isinstance(chosen, str) and is_strategy(chosen):
+            sections[chosen] = {}
+        sections |= {key: value for key, value in values.items() if key not in own}
+        for name, section in sections.items():
+            if not is_strategy(name):
+                raise Misplaced((name,), _unknown_key(str(name), list(cls.model_fields)))
+            if isinstance(section, StrategySettings):
+                section = section.model_dump()
+            if not isinstance(section, dict):
+                raise Misplaced((name,), f"{name} = {section!r}: settings are needed, key by key")
+            settings = check_settings(name, section)
+            if name == chosen and type(settings).model_fields:
+                own[name] = settings
+        return own
+
     @field_validator("strategy")
     @classmethod
     def _known_strategy(cls, name: str) -> str:
-        if not is_strategy(name):
-            known = ", ".join(strategy_names())
-            raise ValueError(f"unknown coaching strategy {name!r}; one of: {known}")
+        find_strategy(name)
         return name
+
+    @property
+    def settings(self) -> StrategySettings:
+        """Of the chosen strategy."""
+        given: StrategySettings | None = (self.model_extra or {}).get(self.strategy)
+        return given if given is not None else find_strategy(self.strategy).Settings()
+
+    @property
+    def crashes_nobody(self) -> bool:
+        """Whether nobody ever crashes, whatever else is set."""
+        return not self.victims and not find_strategy(self.strategy).crashes
+
+
+def _unknown_key(key: str, fields: list[str]) -> str:
+    """What to say of a key that is neither a setting of the coach nor a strategy."""
+    meant: dict[str, list[str]] = {name: [name] for name in (*fields, *strategy_names())}
+    for strategy in strategy_names():
+        for setting in find_strategy(strategy).Settings.model_fields:
+            full = f"{strategy}.{setting}"
+            meant.setdefault(setting, []).append(full)
+            meant[f"{strategy}_{setting}"] = [full]
+    close = difflib.get_close_matches(key, meant, n=1)
+    hint = f" (did you mean {' or '.join(map(repr, meant[close[0]]))}?)" if close else ""
+    known = ", ".join(sorted([*fields, *strategy_names()]))
+    return f"unknown key {key!r} of the coach{hint}; known keys: {known}"
 
 
 def check_robots(names: Sequence[str]) -> tuple[str, ...]:

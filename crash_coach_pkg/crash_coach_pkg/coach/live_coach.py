@@ -1,4 +1,4 @@
-"""The coach node's pure core: follows episodes, moves the rate, revises the plan on request."""
+"""The coach node's pure core: follows episodes, tells the strategy, revises the plan on request."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from crash_coach_common.contract import UserError
 from crash_coach_pkg.coach.coach import BlockRecord, Coach, Planner
 from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
-from crash_coach_pkg.coach.strategies import Progress
+from crash_coach_pkg.coach.strategies.base import Progress
 from crash_coach_pkg.plan import NEXT_STEP, CrashPlan
 
 
@@ -39,11 +39,11 @@ class ControlSettings(BaseModel):
         default=0, ge=0, lt=2**63, description="Keys every draw, together with the episode."
     )
     block_episodes: int = Field(
-        default=32, ge=1, le=1_000_000, description="Adaptive: episodes per evaluation block."
+        default=32, ge=1, le=1_000_000, description="Episodes per evaluation block."
     )
     success_from: Literal["episodes", "trainer"] = Field(
         default="episodes",
-        description="Adaptive: where a block's success rate comes from: the last block_episodes "
+        description="Where a block's success rate comes from: the last block_episodes "
         "episodes, or /trainer/blocks, the evaluation blocks of live training.",
     )
     coach: CoachConfig = Field(default_factory=CoachConfig, description="Who crashes, and how.")
@@ -138,8 +138,7 @@ class Control:
             return None
         self._finished += 1
         progress = self._progress()
-        self._coach.count(self._plan)
-        self._coach.advance(progress)
+        self._coach.finish(self._plan, success, progress)
         if self._settings.success_from == "trainer":
             return None
         self._block.append(success)
@@ -150,7 +149,7 @@ class Control:
         return self._coach.record_block(rate, progress)
 
     def evaluated(self, success_rate: float) -> BlockRecord | None:
-        """Call with a trainer's block; None where the strategy does not read it.
+        """Call with a trainer's block; None where blocks come from elsewhere, or count for nothing.
 
         Raises:
             UserError: a success rate outside [0, 1].
@@ -165,8 +164,8 @@ class Control:
     def configure(self, settings: ControlSettings, now: bool) -> CrashPlan | None:
         """Takes new settings; with ``now``, returns a plan for what is left of the episode.
 
-        A change of the coach's own settings starts a new evaluation block; the rate goes on from
-        where it is unless another strategy, or another fixed rate, is chosen.
+        A change of the coach's own settings starts a new evaluation block; a strategy goes on from
+        its state unless another one is chosen.
         """
         old = self._settings
         if settings.coach != old.coach or settings.seed != old.seed:

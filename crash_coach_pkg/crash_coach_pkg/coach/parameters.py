@@ -1,7 +1,7 @@
 """The coach node's parameters: one table for descriptors, checks and docs, without ROS.
 
-Everything comes from the fields of ControlSettings and CoachConfig and the schemas of the fault
-modes; what a ROS parameter cannot say (null, an empty list) has a stated value instead.
+Everything comes from the fields of ControlSettings and CoachConfig and the schemas of strategies
+and fault modes; what a ROS parameter cannot say (null, an empty list) has a stated value instead.
 """
 
 from __future__ import annotations
@@ -17,22 +17,17 @@ from crash_coach_common.contract import UserError
 from crash_coach_pkg.coach.config import FURTHEST_M, HIGHEST_RETURN, CoachConfig, TeamSpec
 from crash_coach_pkg.coach.draws import check_team
 from crash_coach_pkg.coach.live_coach import ControlSettings
-from crash_coach_pkg.coach.strategies import (
-    ADAPTIVE_ALPHA_MAX,
-    CURRICULUM_ALPHA_MAX,
-    strategy_names,
-)
+from crash_coach_pkg.coach.strategies import find_strategy, make_strategy, strategy_names
+from crash_coach_pkg.coach.strategies.base import Candidates
 from crash_coach_pkg.faults import SYNONYMS, check_parameters, fault_mode, mode_names
 
 Value = bool | int | float | str | Sequence[str] | Sequence[float]
 NOBODY = "none"
-NO_CEILING = -1.0
 NO_RETURN = -HIGHEST_RETURN
 UINT32_MAX = 2**32 - 1
 
-# Fraction and delta need the length of training; a graph has curriculum_episodes instead. Modes'
-# parameters have a ROS parameter each.
-_NOT_IN_A_GRAPH = ("curriculum_fraction", "curriculum_delta", "crash_parameters", "coach")
+# Modes' parameters have a ROS parameter each.
+_NOT_IN_A_GRAPH = ("crash_parameters", "coach")
 
 
 @dataclass(frozen=True)
@@ -55,21 +50,13 @@ SPECIAL = {
     "strategy": ParameterSpec(
         "strategy",
         "fixed",
-        "How the crash rate moves: none, fixed, curriculum, adaptive, or an installed one.",
+        "Who crashes in which episode: a strategy of docs/strategies.md, or an installed one.",
     ),
     "victims": ParameterSpec(
         "victims",
         (NOBODY,),
-        "Robots that crash in every episode, whatever the strategy; ['none']: victims are drawn by "
-        "crash_rate (an empty list has no type in ROS and is refused).",
-    ),
-    "alpha_max": ParameterSpec(
-        "alpha_max",
-        NO_CEILING,
-        f"Highest crash rate; -1: {CURRICULUM_ALPHA_MAX} for curriculum, {ADAPTIVE_ALPHA_MAX} for "
-        "adaptive.",
-        -1.0,
-        1.0,
+        "Robots that crash in every episode, whatever the strategy; ['none']: victims are the "
+        "strategy's (an empty list has no type in ROS and is refused).",
     ),
     "return_above": ParameterSpec(
         "return_above",
@@ -79,13 +66,6 @@ SPECIAL = {
         HIGHEST_RETURN,
     ),
 }
-CURRICULUM_EPISODES = ParameterSpec(
-    "curriculum_episodes",
-    1000,
-    "Curriculum: finished episodes after which alpha_max is reached.",
-    1,
-    1_000_000_000,
-)
 START_SPECS = (
     ParameterSpec(
         "roles",
@@ -122,23 +102,33 @@ BESIDE_A_SCENARIO = frozenset(("enabled", "apply_at", "lease_s"))
 
 def parameter_specs() -> tuple[ParameterSpec, ...]:
     """Every parameter of the coach node that can change while it runs."""
-    return (*_specs(ControlSettings), *_specs(CoachConfig), CURRICULUM_EPISODES, *mode_specs())
+    return (*_specs(ControlSettings), *_specs(CoachConfig), *strategy_specs(), *mode_specs())
+
+
+def strategy_specs() -> Iterator[ParameterSpec]:
+    """``<strategy>.<name>`` for each setting of each known strategy."""
+    for name in strategy_names():
+        yield from _owned_specs("strategy", name, find_strategy(name).Settings)
 
 
 def mode_specs() -> Iterator[ParameterSpec]:
     """``<mode>.<name>`` for each parameter of each known mode."""
     for mode in mode_names():
-        for name, field in fault_mode(mode).Parameters.model_fields.items():
-            low, high = _bounds(field)
-            unit = unit_of(field)
-            text = f"crash_mode {mode}: {field.description}" + (f" [{unit}]" if unit != "1" else "")
-            # ROS knows a type by the default.
-            default = float(field.default) if field.annotation is float else field.default
-            yield ParameterSpec(f"{mode}.{name}", default, text, low, high)
+        yield from _owned_specs("crash_mode", mode, fault_mode(mode).Parameters)
+
+
+def _owned_specs(what: str, owner: str, model: type[BaseModel]) -> Iterator[ParameterSpec]:
+    for name, field in model.model_fields.items():
+        low, high = _bounds(field)
+        unit = unit_of(field)
+        text = f"{what} {owner}: {field.description}" + (f" [{unit}]" if unit != "1" else "")
+        # ROS knows a type by the default.
+        default = float(field.default) if field.annotation is float else field.default
+        yield ParameterSpec(f"{owner}.{name}", default, text, low, high)
 
 
 def unit_of(field: FieldInfo) -> str:
-    """Of a mode's parameter; "1" where it has none."""
+    """Of a mode's parameter or a strategy's setting; "1" where it has none."""
     extra = field.json_schema_extra
     return str(extra.get("unit", "1")) if isinstance(extra, dict) else "1"
 
@@ -190,20 +180,14 @@ def build_settings(values: Mapping[str, Value], team: TeamSpec) -> ControlSettin
     Raises:
         UserError: naming the parameter, its value and what would be right.
     """
-    alpha_max = _number(values["alpha_max"])
-    if alpha_max != NO_CEILING and alpha_max < 0:
-        raise UserError(f"alpha_max {alpha_max}: 0 to 1, or -1 for the strategy's own")
-    ceiling = CURRICULUM_ALPHA_MAX if alpha_max == NO_CEILING else alpha_max
     return_above = _number(values["return_above"])
     coach: dict[str, Any] = {
         **{name: values[name] for name in CoachConfig.model_fields if name in values},
         "victims": _names("victims", values["victims"]),
-        "alpha_max": None if alpha_max == NO_CEILING else alpha_max,
-        # Where alpha_max is 0, any increment ends there.
-        "curriculum_delta": ceiling / _number(values["curriculum_episodes"]) or 1.0,
         "return_above": None if return_above == NO_RETURN else return_above,
         "near_point_m": _point(values),
         "crash_parameters": _mode_parameters(values),
+        **{name: _owned(values, name) for name in strategy_names()},
     }
     own: dict[str, Any] = {
         name: values[name] for name in ControlSettings.model_fields if name in values
@@ -214,16 +198,30 @@ def build_settings(values: Mapping[str, Value], team: TeamSpec) -> ControlSettin
     except ValidationError as error:
         raise UserError(_reasons(error)) from None
     check_team(config, team)
+    check_length(config)
     return settings
+
+
+def check_length(config: CoachConfig) -> None:
+    """Raises UserError for a strategy that needs the length of training, which no graph knows."""
+    strategy = make_strategy(config.strategy, config.settings, Candidates(1, 1))
+    if reason := strategy.needs_length():
+        raise UserError(reason)
+
+
+def _owned(values: Mapping[str, Value], owner: str) -> dict[str, float]:
+    """What a strategy or mode has among the values, by its own names."""
+    start = f"{owner}."
+    return {
+        name.removeprefix(start): _number(value)
+        for name, value in values.items()
+        if name.startswith(start)
+    }
 
 
 def _mode_parameters(values: Mapping[str, Value]) -> dict[str, float]:
     """Those of the chosen mode. The others are checked too: choosing their mode must not fail."""
-    by_mode: dict[str, dict[str, float]] = {name: {} for name in mode_names()}
-    for name in values:
-        mode, dot, parameter = name.partition(".")
-        if dot:
-            by_mode[mode][parameter] = _number(values[name])
+    by_mode = {mode: _owned(values, mode) for mode in mode_names()}
     for mode, parameters in by_mode.items():
         check_parameters(mode, parameters)
     chosen = str(values["crash_mode"])
@@ -242,18 +240,16 @@ def _point(values: Mapping[str, Value]) -> tuple[float, ...]:
 
 
 # When they change, the running episode need not be planned again.
-NOT_IN_PLAN = frozenset(
-    ("apply_at", "lease_s", "block_episodes", "curriculum_episodes", "success_from")
-)
+NOT_IN_PLAN = frozenset(("apply_at", "lease_s", "block_episodes", "success_from"))
 
 
 def counts_now(settings: ControlSettings, changed: Collection[str], endless: bool) -> bool:
     """Whether a change concerns the running episode; in an ``endless`` one there is no next."""
-    mode = fault_mode(settings.coach.crash_mode).name
+    owners = (fault_mode(settings.coach.crash_mode).name, settings.coach.strategy)
     of_plan = [
         name
         for name in changed
-        if name not in NOT_IN_PLAN and ("." not in name or name.startswith(f"{mode}."))
+        if name not in NOT_IN_PLAN and ("." not in name or name.split(".")[0] in owners)
     ]
     return bool(of_plan) and (endless or settings.apply_at == "next_step")
 
@@ -275,8 +271,10 @@ def check_change(settings: ControlSettings, changed: Sequence[str]) -> None:
             f"{asked[0]} would have no effect: enabled is false (as /coach/clear_all leaves it); "
             "set enabled to true first, or in the same call"
         )
-    if coach.strategy == "none" and not coach.victims and "strategy" not in changed:
-        raise UserError(f"{asked[0]} would have no effect: strategy is none; set fixed, for one")
+    if coach.crashes_nobody and "strategy" not in changed:
+        raise UserError(
+            f"{asked[0]} would have no effect: strategy is {coach.strategy}; set fixed, for one"
+        )
 
 
 def check_beside(scenario: str, changed: Sequence[str]) -> None:

@@ -8,19 +8,22 @@ the same law as rejection.
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import numpy as np
 
 from crash_coach_common.contract import BoolArray
-from crash_coach_pkg.coach.config import CapRule
 
+CapRule = Literal["ceil", "floor", "authors"]
 _STREAM = 0xC0AC4  # keeps crash draws apart from the environment's stream of the same seed
 
 
-def episode_rng(seed: int, episode: int) -> np.random.Generator:
-    """The generator of one episode's crash draws, a function of (seed, episode) alone."""
+def episode_rng(seed: int, episode: int, stream: int = 0) -> np.random.Generator:
+    """The generator of one episode's crash draws, a function of (seed, episode, stream) alone."""
     key = np.array([seed ^ _STREAM, episode], dtype=np.uint64)
-    return np.random.Generator(np.random.Philox(key=key))
+    # The counter's highest word: streams that no draw can run into.
+    counter = np.array([0, 0, 0, stream], dtype=np.uint64)
+    return np.random.Generator(np.random.Philox(key=key, counter=counter))
 
 
 def crash_cap(rule: CapRule, n: int, rate: float, limit: int, resample: bool) -> int:

@@ -1,8 +1,10 @@
-"""A mode's parameters as plain data: for ROS descriptors, documentation and checks."""
+"""Schemas of numbers as plain data: for ROS descriptors, documentation and checks."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
+
+from pydantic import BaseModel
 
 from crash_coach_pkg.faults.base import FaultMode
 
@@ -28,21 +30,30 @@ def parameters_of(mode: type[FaultMode]) -> tuple[ParameterInfo, ...]:
     Raises:
         ValueError: a parameter that is not a number, or lacks default, range, unit or description.
     """
-    properties = mode.Parameters.model_json_schema().get("properties", {})
-    return tuple(_info(mode, name, field) for name, field in properties.items())
+    return number_fields(f"fault mode {mode.name!r}: parameter", mode.Parameters)
 
 
-def _info(mode: type[FaultMode], name: str, field: dict[str, object]) -> ParameterInfo:
-    place = f"fault mode {mode.name!r}: parameter {name!r}"
+def number_fields(what: str, model: type[BaseModel]) -> tuple[ParameterInfo, ...]:
+    """The fields of ``model``, each of which errors call a ``what``.
+
+    Raises:
+        ValueError: a field that is not a number, or lacks default, range, unit or description.
+    """
+    properties = model.model_json_schema().get("properties", {})
+    return tuple(_info(f"{what} {name!r}", name, field) for name, field in properties.items())
+
+
+def _info(place: str, name: str, field: dict[str, object]) -> ParameterInfo:
     kind = field.get("type")
     if kind not in ("integer", "number"):
         raise ValueError(f"{place} must be an int or a float, not {kind}")
-    missing = [key for key in _KEYS if key not in field]
+    found = {"minimum": field.get("exclusiveMinimum"), **field}
+    missing = [key for key in _KEYS if found.get(key) is None]
     if missing:
-        raise ValueError(f"{place} has no {', '.join(missing)} (see FaultParameters)")
+        raise ValueError(f"{place} has no {', '.join(missing)}")
     number = int if kind == "integer" else float
-    default, low, high = (number(str(field[key])) for key in _KEYS[:3])
-    unit, description = (str(field[key]) for key in _KEYS[3:])
-    given = field.get("examples")
+    default, low, high = (number(str(found[key])) for key in _KEYS[:3])
+    unit, description = (str(found[key]) for key in _KEYS[3:])
+    given = found.get("examples")
     example = number(str(given[0])) if isinstance(given, list) else default or number(high / 20)
     return ParameterInfo(name, kind == "integer", default, low, high, unit, description, example)

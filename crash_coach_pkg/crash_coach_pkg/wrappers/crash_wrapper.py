@@ -14,7 +14,7 @@ from pettingzoo.utils import BaseParallelWrapper
 from crash_coach_common.contract import BoolArray, UserError
 from crash_coach_pkg.coach.coach import BlockRecord, Coach
 from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
-from crash_coach_pkg.coach.strategies import Progress
+from crash_coach_pkg.coach.strategies.base import Progress
 from crash_coach_pkg.faults import is_observation_mode, unmet_needs
 from crash_coach_pkg.faults.action_tools import ACTION_OFFERS, UNTOLD, ActionTools
 from crash_coach_pkg.faults.team_faults import TeamFaults
@@ -135,17 +135,18 @@ class CrashWrapper(BaseParallelWrapper):  # type: ignore[misc]
         }
         return seen, rewards, terminations, truncations, self._told(infos, told)
 
-    def end_episode(self, env_steps: int, total_steps: int = 0) -> None:
+    def end_episode(self, success: bool, env_steps: int, total_steps: int = 0) -> None:
         """Tells the coach of the finished training episode.
 
         Args:
+            success: of the episode.
             env_steps: of training so far; total_steps: of all training, 0: unknown.
         """
         self._begun()
         assert self._plan is not None
         self._episodes_done += 1
-        self.coach.count(self._plan)
-        self.coach.advance(Progress(env_steps, total_steps, self._episodes_done))
+        progress = Progress(env_steps, total_steps, self._episodes_done)
+        self.coach.finish(self._plan, success, progress)
 
     def end_block(self, success_rate: float, env_steps: int, total_steps: int = 0) -> BlockRecord:
         """Tells the coach the success rate of an evaluation block, and moves the crash rate.

@@ -158,7 +158,11 @@ def evaluate(
 
 
 def evaluate_in(
-    env: BatchEnv, policy: RecurrentPolicy, condition: Condition, episodes: range, seed: int
+    env: BatchEnv,
+    policy: RecurrentPolicy,
+    condition: Condition | Planned,
+    episodes: range,
+    seed: int,
 ) -> Evaluation:
     """As ``evaluate``, in an environment that nothing else uses, for any range of episodes."""
     return _Run(env, RecurrentTeam(policy, env), condition, seed).evaluation(episodes)

@@ -16,6 +16,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from crash_coach_pkg.coach.config import CoachConfig
 from policy_pkg.checkpoint import (
     AGENT,
     AT_BEST,
@@ -205,8 +206,9 @@ def method_name(path: Path, scenario: str, settings: Mapping[str, Any]) -> str:
     if name:
         return name
     parts = [settings["learner"]["algorithm"]]
-    strategy = settings.get("coach", {}).get("strategy", "none")
-    return ", ".join(parts if strategy == "none" else [*parts, strategy])
+    nobody = CoachConfig().strategy
+    strategy = settings.get("coach", {}).get("strategy", nobody)
+    return ", ".join(parts if strategy == nobody else [*parts, strategy])
 
 
 def _clash(runs: Sequence[Run]) -> str | None:

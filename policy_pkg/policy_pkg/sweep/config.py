@@ -63,7 +63,7 @@ class SweepSize(StrictModel):
 class SweepConfig(StrictModel):
     """Every method on every scenario with every seed is a run of ``config``.
 
-    Settings are those of a training configuration, ``coach.beta: 0.7`` as ``--set`` has them.
+    Settings are those of a training configuration, ``learner.lr: 1e-3`` as ``--set`` has them.
     """
 
     config: str = Field(description="training configuration: a name, or path of a .yaml file")
@@ -258,12 +258,7 @@ class _Expansion:
 def check_fits(config: TrainConfig) -> None:
     """Raises UserError where the scenario is unknown, or the coach's settings do not fit it."""
     spec = _spec(config.scenario_source())
-    coach = Coach(config.coach, TeamSpec.of(spec), config.seed)
-    if coach.needs_success and not spec.reports_success:
-        raise ConfigError(
-            f"scenario {config.scenario!r} reports no success, which coach.strategy = "
-            f"{config.coach.strategy!r} needs"
-        )
+    Coach(config.coach, TeamSpec.of(spec), config.seed).check_scenario(spec)
 
 
 @cache

@@ -54,7 +54,7 @@ class Counters(Schedule):
 class Block:
     """The greedy episodes of one evaluation block."""
 
-    crashed: Evaluation  # crashes drawn at the coach's rate
+    crashed: Evaluation  # crashes as the coach plans them now
     crash_free: Evaluation | None  # the same episodes without crashes
     victims: tuple[Evaluation, ...] = ()  # one per robot, which alone crashes
 

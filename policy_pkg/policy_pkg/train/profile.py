@@ -165,7 +165,7 @@ class _Meter:
             (session.rollout, ROLLOUT, ("step",)),
             (session.replay, REPLAY, ("add", "sample")),
             (session.learner, LEARNER, ("update",)),
-            (session.coach, COACH, ("plan", "count", "advance", "record_block")),
+            (session.coach, COACH, ("plan", "finish", "record_block")),
         ):
             for method in methods:
                 watch(owner, method, part)

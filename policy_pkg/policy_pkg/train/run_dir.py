@@ -44,6 +44,7 @@ TENSORBOARD = "tensorboard"
 SCENARIO = "scenario"
 LENGTHS = ("total_steps", "gradient_steps")  # of a run: trained in the simulator, or offline
 FORMAT = "crash-coach-run"
+_CURRICULUM = ("curriculum_fraction", "curriculum_delta")  # see _own_settings
 RunConfig = TrainConfig | OfflineConfig
 LIBRARIES = ("numpy", "torch", "pymunk", "numba")
 
@@ -172,7 +173,21 @@ def read_run(out_dir: Path) -> dict[str, Any]:
         raise RunError(f"{path} cannot be read: {error}") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise RunError(f'{path} does not describe a run: no "format": "{FORMAT}"')
+    if isinstance(config := content.get("config"), dict) and "beta" in config.get("coach", {}):
+        config["coach"] = _own_settings(config["coach"])
     return content
+
+
+def _own_settings(coach: Mapping[str, Any]) -> dict[str, Any]:
+    """A coach's configuration of when strategies had no settings of their own."""
+    kept = {k: v for k, v in coach.items() if k not in ("beta", "rho", "alpha_max", *_CURRICULUM)}
+    fraction, delta = (coach[key] for key in _CURRICULUM)
+    highest = {} if coach["alpha_max"] is None else {"alpha_max": coach["alpha_max"]}
+    curriculum = {"fraction": fraction, **highest}
+    if delta is not None:
+        curriculum["episodes"] = max(1, round(curriculum.get("alpha_max", 0.1) / delta))
+    adaptive = {"beta": coach["beta"], "rho": coach["rho"], **highest}
+    return {**kept, "adaptive": adaptive, "curriculum": curriculum}
 
 
 def describe_run(config: RunConfig, data: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -247,7 +262,7 @@ def _check_same_data(run: dict[str, Any], data: dict[str, Any] | None, out_dir: 
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """{"coach": {"beta": 1}} -> {"coach.beta": 1}"""
+    """{"learner": {"lr": 1}} -> {"learner.lr": 1}"""
     out: dict[str, Any] = {}
     for key, value in values.items():
         if isinstance(value, dict):

@@ -9,14 +9,14 @@ import numpy as np
 from crash_coach_common.contract import BatchEnv, EnvSpec, UserError
 from crash_coach_pkg.coach.coach import BlockRecord, Coach
 from crash_coach_pkg.coach.config import TeamSpec
-from crash_coach_pkg.coach.strategies import Progress
+from crash_coach_pkg.coach.strategies.base import Progress
 from crash_coach_pkg.faults import unmet_needs
 from crash_coach_pkg.faults.action_tools import ACTION_OFFERS
 from crash_coach_pkg.plan import CrashPlan
 from policy_pkg.episode import Episode, Sizes
 from policy_pkg.learner.learner import Learner
 from policy_pkg.learner.replay import Replay
-from policy_pkg.play.conditions import Condition, crash_free, named
+from policy_pkg.play.conditions import Condition, Planned, crash_free, named
 from policy_pkg.play.evaluate import Evaluation, evaluate_in
 from policy_pkg.play.rollout import Finished, Rollout
 from policy_pkg.policy import RecurrentPolicy
@@ -170,11 +170,7 @@ class TrainSession(EpisodeSession):
             self.coach = Coach(config.coach, TeamSpec.of(spec), config.seed)
         except ValueError as error:
             raise UserError(f"coach of scenario {spec.scenario!r}: {error}") from error
-        if self.coach.needs_success and not spec.reports_success:
-            raise UserError(
-                f"scenario {spec.scenario!r} reports no success, which coach.strategy = "
-                f"{config.coach.strategy!r} needs; use none, fixed or curriculum"
-            )
+        self.coach.check_scenario(spec)
         if reason := unmet_needs(config.coach.crash_mode, ACTION_OFFERS):
             raise UserError(f"coach of scenario {spec.scenario!r}: {reason}")
         super().__init__(config, spec)
@@ -227,18 +223,13 @@ class TrainSession(EpisodeSession):
 
     def _take(self, finished: Finished) -> None:
         self._keep(finished.episode, finished.success)
-        self.coach.count(finished.plan)
-        self.coach.advance(self.progress)
+        self.coach.finish(finished.plan, finished.success, self.progress)
 
     def test(self) -> Block:
         """Plays the block's episodes greedily; each block has episodes of its own."""
         count = self.config.test_episodes
         episodes = range(self.counters.blocks * count, (self.counters.blocks + 1) * count)
-        crash = self.config.coach
-        if crash.strategy != "none":
-            at_rate = {"strategy": "fixed", "crash_rate": self.coach.rate}
-            crash = crash.model_copy(update=at_rate)
-        block = self._play(Condition("block", crash), episodes)
+        block = self._play(Planned("block", lambda team, seed: self.coach.keyed(seed)), episodes)
         victims = self._victims()
         if not self.config.test_crash_free:
             return Block(block, None, victims)
@@ -255,7 +246,7 @@ class TrainSession(EpisodeSession):
             for robot in (self.env.spec.robots if count else ())
         )
 
-    def _play(self, condition: Condition, episodes: range) -> Evaluation:
+    def _play(self, condition: Condition | Planned, episodes: range) -> Evaluation:
         seed = self.config.seed ^ TEST_KEY
         return evaluate_in(self.test_env, self.policy, condition, episodes, seed)
 
@@ -265,7 +256,9 @@ class TrainSession(EpisodeSession):
         self.best_is_now = self.best is None or block.rank >= self.best
         if self.best_is_now:
             self.best = block.rank
-        record = self.coach.record_block(block.crashed.success_rate, self.progress)
+        free = None if block.crash_free is None else block.crash_free.success_rate
+        victims = tuple(played.success_rate for played in block.victims)
+        record = self.coach.record_block(block.crashed.success_rate, self.progress, free, victims)
         return self._close(record, block)
 
     def state_dict(self) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:

@@ -107,7 +107,7 @@ def test_undoing_after_the_episode_changed_plans_the_new_one() -> None:
 
 
 def test_adaptive_moves_by_complete_blocks_only() -> None:
-    coach = control(strategy="adaptive", beta=0.5, rho=0.5, block_episodes=4)
+    coach = control(strategy="adaptive", adaptive={"beta": 0.5, "rho": 0.5}, block_episodes=4)
     rates = []
     for episode, success in enumerate([1, 1, 0, 0, 0, 0, 0, 1, 1]):
         coach.follow(episode)
@@ -119,7 +119,10 @@ def test_adaptive_moves_by_complete_blocks_only() -> None:
 
 
 def test_curriculum_follows_finished_episodes() -> None:
-    coach = Control(settings(strategy="curriculum", alpha_max=0.4, curriculum_episodes=4), TEAM, 0)
+    wanted = settings(
+        strategy="curriculum", **{"curriculum.alpha_max": 0.4, "curriculum.episodes": 4}
+    )
+    coach = Control(wanted, TEAM, 0)
     rates = []
     for episode in range(6):
         coach.follow(episode)
@@ -129,19 +132,21 @@ def test_curriculum_follows_finished_episodes() -> None:
 
 
 def test_the_rate_goes_on_through_a_change_of_settings() -> None:
-    coach = control(strategy="adaptive", rho=0.5, block_episodes=1)
+    coach = control(strategy="adaptive", adaptive={"rho": 0.5}, block_episodes=1)
     coach.follow(0)
     coach.finish(True)
-    coach.configure(settings(strategy="adaptive", rho=0.1), now=False)
+    coach.configure(settings(strategy="adaptive", **{"adaptive.rho": 0.1}), now=False)
     assert coach.rate == 0.5
-    coach.configure(settings(strategy="adaptive", alpha_max=0.2), now=False)
+    coach.configure(settings(strategy="adaptive", **{"adaptive.alpha_max": 0.2}), now=False)
     assert coach.rate == 0.2
     coach.configure(settings(strategy="fixed", crash_rate=0.9), now=False)
     assert coach.rate == 0.9
     coach.configure(settings(strategy="fixed", crash_rate=0.8), now=False)
     assert coach.rate == 0.8
     # Found by the parameter fuzz: the same settings once gave another rate than from the start.
-    coach.configure(settings(strategy="fixed", crash_rate=0.8, alpha_max=0.1), now=False)
+    coach.configure(
+        settings(strategy="fixed", crash_rate=0.8, **{"adaptive.alpha_max": 0.1}), now=False
+    )
     assert coach.rate == 0.8
     coach.configure(settings(strategy="adaptive"), now=False)
     assert coach.rate == 0.0
@@ -180,7 +185,7 @@ def left(episode: int = 4, revision: int = 900, rate: float = 0.25) -> CrashPlan
 
 
 def test_a_new_coach_takes_over_plan_and_rate_and_plans_the_next_episode_itself() -> None:
-    coach = control(revision=10, strategy="adaptive", rho=0.5, block_episodes=1)
+    coach = control(revision=10, strategy="adaptive", adaptive={"rho": 0.5}, block_episodes=1)
     plan = coach.adopt(left())
     assert plan is not None
     assert plan == replace(left(), revision=901)
@@ -212,7 +217,9 @@ def test_the_episode_may_have_changed_since() -> None:
 
 
 def test_a_curriculum_goes_on_from_the_episodes_number() -> None:
-    wanted = settings(strategy="curriculum", alpha_max=0.4, curriculum_episodes=8)
+    wanted = settings(
+        strategy="curriculum", **{"curriculum.alpha_max": 0.4, "curriculum.episodes": 8}
+    )
     coach = Control(wanted, TEAM, 0)
     coach.adopt(left(episode=4, rate=0.2))
     assert coach.rate == pytest.approx(0.2)
@@ -256,7 +263,7 @@ def test_bad_teams(names: list[str], message: str) -> None:
 
 
 def test_a_trainers_blocks_take_the_place_of_the_coachs_own() -> None:
-    adaptive = {"strategy": "adaptive", "beta": 0.5, "rho": 0.5, "alpha_max": 0.8}
+    adaptive = {"strategy": "adaptive", "adaptive": {"beta": 0.5, "rho": 0.5, "alpha_max": 0.8}}
     coach = control(success_from="trainer", block_episodes=1, **adaptive)
     coach.follow(0)
     assert coach.finish(True) is None
@@ -269,7 +276,7 @@ def test_a_trainers_blocks_take_the_place_of_the_coachs_own() -> None:
     assert later.rate == 0.5
     with pytest.raises(UserError, match=r"success rate 1.5 of a trainer's block"):
         coach.evaluated(1.5)
-    coach.configure(settings(enabled=False, success_from="trainer", **adaptive), now=True)
+    coach.configure(settings(enabled=False, success_from="trainer", strategy="adaptive"), now=True)
     assert coach.evaluated(0.75) is None
     own = control(**adaptive)
     own.follow(0)

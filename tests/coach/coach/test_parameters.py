@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from crash_coach_common.contract import UserError
-from crash_coach_pkg.coach.config import TeamSpec
+from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
 from crash_coach_pkg.coach.live_coach import ControlSettings
 from crash_coach_pkg.coach.parameters import (
     START_SPECS,
@@ -18,6 +18,7 @@ from crash_coach_pkg.coach.parameters import (
     counts_now,
     parameter_specs,
 )
+from crash_coach_pkg.coach.strategies import find_strategy, strategy_names
 from crash_coach_pkg.faults import fault_mode, mode_names
 
 TEAM = TeamSpec(("robot_1", "robot_2", "robot_3"), ("scout", "scout", "hauler"), 0.1)
@@ -34,15 +35,21 @@ def test_every_setting_is_a_parameter_with_a_description() -> None:
         for mode in mode_names()
         for name in fault_mode(mode).Parameters.model_fields
     ]
+    of_strategies = [
+        f"{strategy}.{name}"
+        for strategy in strategy_names()
+        for name in find_strategy(strategy).Settings.model_fields
+    ]
     assert "delay.steps" in of_modes
+    assert {"adaptive.beta", "deck.two", "failure.floor"} < set(of_strategies)
     names = [spec.name for spec in parameter_specs()]
     assert len(set(names)) == len(names)
     assert set(names) == {
         "enabled", "strategy", "crash_rate", "crash_mode", "victims", "start_step",
-        "duration_steps", "max_crashed", "min_alive", "beta", "rho", "alpha_max", "seed",
+        "duration_steps", "max_crashed", "min_alive", "seed",
         "apply_at", "lease_s", "resample", "cap_rule", "crashed_exactly", "block_episodes",
-        "curriculum_episodes", "victim_role", "hazard_rate_hz", "near_point_m", "near_radius_m",
-        "return_above", "success_from", *of_modes,
+        "victim_role", "hazard_rate_hz", "near_point_m", "near_radius_m",
+        "return_above", "success_from", *of_modes, *of_strategies,
     }  # fmt: skip
     for spec in parameter_specs():
         assert spec.description
@@ -62,9 +69,11 @@ def test_every_setting_is_a_parameter_with_a_description() -> None:
         ({"victims": ()}, None),
         ({"crash_rate": float("nan")}, "crash_rate nan: .*finite"),
         ({"crash_rate": 1.5}, "crash_rate 1.5: .*less than or equal to 1"),
-        ({"rho": 0.0}, "rho 0.0: .*greater than 0"),
-        ({"alpha_max": -0.5}, "alpha_max -0.5: 0 to 1, or -1"),
-        ({"alpha_max": 0.0, "strategy": "curriculum"}, None),
+        ({"adaptive.rho": 0.0}, "strategy adaptive: setting rho = 0.0: .*greater than 0"),
+        ({"adaptive.alpha_max": -0.5}, "setting alpha_max = -0.5: .*greater than or equal to 0"),
+        ({"deck.nobody": 0, "deck.one": 0, "deck.two": 0}, "strategy deck: a deck without cards"),
+        ({"strategy": "curriculum"}, "length of training is unknown here; set curriculum.episodes"),
+        ({"curriculum.episodes": 5, "strategy": "curriculum"}, None),
         ({"crash_mode": "explode"}, "crash_mode 'explode': unknown crash mode .* mute, ra"),
         ({"victims": "robot_1"}, "victims 'robot_1' is not a list of names"),
         ({"victim_role": "cook"}, "unknown victim_role 'cook'; one of: scout, hauler"),
@@ -143,9 +152,19 @@ def test_the_chosen_modes_parameters_count() -> None:
     assert settings(**values, crash_mode="noise").coach.crash_parameters == {"stddev": 0.5}
 
 
+def test_the_chosen_strategys_settings_count() -> None:
+    values: dict[str, Any] = {"adaptive.rho": 0.5, "deck.two": 4}
+    assert settings(**values).coach == settings().coach
+    assert settings(**values, strategy="deck").coach.settings.model_dump() == {
+        "nobody": 2, "one": 2, "two": 4, "three": 0,
+    }  # fmt: skip
+    adaptive = settings(**values, strategy="adaptive").coach
+    assert adaptive == CoachConfig(strategy="adaptive", adaptive={"rho": 0.5})
+
+
 def test_what_ros_cannot_say_has_a_value_of_its_own() -> None:
     off = settings().coach
-    assert (off.victims, off.alpha_max, off.return_above, off.triggered) == ((), None, None, False)
+    assert (off.victims, off.return_above, off.triggered) == ((), None, False)
     near = settings(near_point_m=(1.0, -2.0), near_radius_m=0.5).coach
     assert (near.near_point_m, near.near_radius_m) == ((1.0, -2.0), 0.5)
     assert settings(return_above=-5.0).coach.return_above == -5.0
@@ -160,6 +179,8 @@ def test_what_ros_cannot_say_has_a_value_of_its_own() -> None:
         (set(), {"apply_at": "next_step"}, False),
         ({"delay.steps"}, {"apply_at": "next_step"}, False),
         ({"delay.steps"}, {"apply_at": "next_step", "crash_mode": "delay"}, True),
+        ({"deck.two"}, {"apply_at": "next_step"}, False),
+        ({"deck.two"}, {"apply_at": "next_step", "strategy": "deck"}, True),
     ],
 )
 def test_which_changes_concern_the_running_episode(

@@ -93,7 +93,9 @@ def test_no_robot_step_is_treated_differently(fault: dict[str, Any], takeover: i
 
 def test_the_rate_goes_on_after_a_lease_ran_out() -> None:
     gate = GateState(TEAM.n, lockstep=True, first_lease_s=10.0)
-    adaptive = ControlSettings(coach=CoachConfig(strategy="adaptive", rho=0.5), block_episodes=1)
+    adaptive = ControlSettings(
+        coach=CoachConfig(strategy="adaptive", adaptive={"rho": 0.5}), block_episodes=1
+    )
     first = Control(adaptive, TEAM, 100)
     for episode in range(2):
         plan = first.follow(episode)

@@ -23,7 +23,7 @@ def test_runs_have_stable_names_seed_by_seed(tmp_path: Path) -> None:
     ]
     last = runs[-1].config
     assert (last.scenario, last.seed, last.coach.strategy) == ("buttons_8", 3, "adaptive")
-    assert (last.n_envs, last.learner.hidden, last.coach.rho) == (5, 16, 0.3)
+    assert (last.n_envs, last.learner.hidden, last.coach.settings.rho) == (5, 16, 0.3)
     assert last.epsilon_anneal_steps == 50_000  # of the configuration
 
 
@@ -34,23 +34,27 @@ def test_a_report_reads_the_method_from_the_folder(tmp_path: Path) -> None:
 
 
 def test_a_grid_is_every_combination(tmp_path: Path) -> None:
-    grid = {"coach.beta": [0.6, 0.75], "coach.rho": [0.001, 0.3]}
-    runs = tiny_runs(tmp_path, methods={}, grid=grid)
+    grid = {"coach.adaptive.beta": [0.6, 0.75], "coach.adaptive.rho": [0.001, 0.3]}
+    runs = tiny_runs(tmp_path, config="buttons/adaptive", methods={}, grid=grid)
     assert [run.name for run in runs] == [
         "buttons/beta_0.6-rho_0.001-s0",
         "buttons/beta_0.6-rho_0.3-s0",
         "buttons/beta_0.75-rho_0.001-s0",
         "buttons/beta_0.75-rho_0.3-s0",
     ]
-    assert (runs[2].config.coach.beta, runs[2].config.coach.rho) == (0.75, 0.001)
+    assert (runs[2].config.coach.settings.beta, runs[2].config.coach.settings.rho) == (0.75, 0.001)
 
 
 def test_a_size_counts_over_the_rest(tmp_path: Path) -> None:
-    small = {"seeds": [7], "methods": ["adaptive"], "set": {"n_envs": 2, "coach.rho": 0.5}}
+    small = {"seeds": [7], "methods": ["adaptive"], "set": {"n_envs": 2, "coach.adaptive.rho": 0.5}}
     path = write_sweep(tmp_path / "sweep.yaml", sizes={"small": small})
     (run,) = load_sweep(path, "small")
     assert run.name == "buttons/adaptive-s7"
-    assert (run.config.n_envs, run.config.coach.rho, run.config.test_episodes) == (2, 0.5, 4)
+    assert (run.config.n_envs, run.config.coach.settings.rho, run.config.test_episodes) == (
+        2,
+        0.5,
+        4,
+    )
     assert len(load_sweep(path)) == 2
 
 
@@ -59,7 +63,7 @@ def test_settings_of_a_scenario_count_over_those_of_all(tmp_path: Path) -> None:
     path = write_sweep(
         tmp_path / "sweep.yaml",
         scenarios=["buttons", "buttons_8"],
-        scenario_set={"buttons_8": {"coach.rho": 0.4, "n_envs": 3, "test_episodes": 7}},
+        scenario_set={"buttons_8": {"coach.adaptive.rho": 0.4, "n_envs": 3, "test_episodes": 7}},
         sizes={
             "small": {
                 "methods": ["adaptive"],
@@ -71,7 +75,7 @@ def test_settings_of_a_scenario_count_over_those_of_all(tmp_path: Path) -> None:
 
     def settings(size: str) -> dict[str, tuple[float, ...]]:
         return {
-            run.name: (c.coach.rho, c.n_envs, c.test_episodes, c.total_steps)
+            run.name: (c.coach.settings.rho, c.n_envs, c.test_episodes, c.total_steps)
             for run in load_sweep(path, size)
             for c in [run.config]
             if c.coach.strategy == "adaptive"
@@ -97,7 +101,7 @@ def test_settings_of_a_scenario_count_over_those_of_all(tmp_path: Path) -> None:
         ),
         (
             {"scenario_set": {"buttons": {"coach.betta": 1}}},
-            r"sweep\.yaml:\d+: unknown key 'coach.betta'.*'beta'",
+            r"sweep\.yaml:\d+: unknown key 'betta' of the coach.*'adaptive.beta'",
         ),
         ({"setings": {}}, r"sweep\.yaml:\d+: unknown key 'setings' .*did you mean 'set'"),
         ({"seeds": []}, r"sweep\.yaml:\d+: seeds = \[\]"),
@@ -105,7 +109,7 @@ def test_settings_of_a_scenario_count_over_those_of_all(tmp_path: Path) -> None:
         ({"seeds": [-1]}, r"sweep\.yaml:18: seed = -1"),
         ({"config": "buttons/qmx"}, r"sweep\.yaml:1: no training config 'buttons/qmx'"),
         ({"scenarios": ["butons"]}, "unknown scenario 'butons'.*did you mean 'buttons'"),
-        ({"set": {"coach.betta": 1}}, r"sweep\.yaml:3: unknown key 'coach.betta'.*'beta'"),
+        ({"set": {"coach.betta": 1}}, r"sweep\.yaml:3: unknown key 'betta' .*'adaptive.beta'"),
         ({"set": {"n_envs.x": 1}}, r"sweep\.yaml:3: 'n_envs' is a value"),
         ({"set": {"seed": 1}}, r"sweep\.yaml:3: seed is no setting of a sweep: use seeds"),
         ({"methods": {"a": {"n_envs": 0}}}, r"sweep\.yaml:\d+: n_envs = 0: .*greater than"),
@@ -144,10 +148,10 @@ def test_the_papers_sweeps_can_be_read(name: str, size: str) -> None:
     ("name", "size", "methods", "seeds"),
     [
         ("robust", "full", 1, 20),
-        ("share", "full", 3, 20),
+        ("share", "full", 4, 20),
         ("ablation", "full", 5, 10),
-        ("combat", "full", 4, 5),
-        ("combat", "3s_vs_5z", 4, 3),
+        ("combat", "full", 6, 5),
+        ("combat", "3s_vs_5z", 6, 3),
     ],
 )
 def test_the_recipes_sweeps_give_every_method_the_same_learner(

@@ -44,7 +44,11 @@ CONFIG = TrainConfig.model_validate(
             "hypernet_hidden": 8,
             "target_update_interval_episodes": 20,
         },
-        "coach": {"strategy": "adaptive", "rho": 0.3, "beta": 0.0, "crash_mode": "random"},
+        "coach": {
+            "strategy": "adaptive",
+            "adaptive": {"rho": 0.3, "beta": 0.0},
+            "crash_mode": "random",
+        },
     }
 )
 
@@ -126,6 +130,32 @@ def test_faults_with_memory_go_on_where_they_were(tmp_path: Path) -> None:
         "replay",
     )
     assert 4 in replay["faults"]
+
+
+@pytest.mark.parametrize("strategy", ["curriculum", "deck", "learnability", "failure"])
+def test_a_strategys_state_goes_on_where_it_was(tmp_path: Path, strategy: str) -> None:
+    """Killed by surprise between two checkpoints, with episodes under way."""
+    coach = {"strategy": strategy, "crash_mode": "random", "min_alive": 1}
+    settings = {**CONFIG.model_dump(), "total_steps": 1200, "coach": coach}
+    config = TrainConfig.model_validate(settings)
+    train(config, tmp_path / "whole")
+
+    def stop(report: ProgressReport) -> None:
+        if report.steps >= 1005:
+            raise Stopped
+
+    ticks = iter(range(10**9))
+    with pytest.raises(Stopped):
+        train(config, tmp_path / "run", progress=stop, clock=lambda: float(next(ticks)))
+    manifest = read_manifest(find_checkpoint(tmp_path / "run"))
+    assert manifest.progress["env_steps"] == 800
+    saved = manifest.training["coach"]["strategy"]
+    assert set(saved) == {
+        "curriculum": {"rate"}, "deck": set(), "learnability": {"success", "counts"},
+        "failure": {"success", "counts"},
+    }[strategy]  # fmt: skip
+    train(config, tmp_path / "run", resume=True)
+    assert_same_run(tmp_path / "run", tmp_path / "whole")
 
 
 def test_every_setting_of_the_recipe_goes_on_where_it_was(tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ def test_the_full_file_shows_every_key_with_its_default() -> None:
 def test_the_two_methods_differ_by_the_coach_only() -> None:
     for plain, coached in (("qmix", "adaptive"), ("demo_qmix", "demo_adaptive")):
         one, other = (load_train_config(f"buttons/{name}") for name in (plain, coached))
-        assert (other.coach.strategy, other.coach.beta) == ("adaptive", 0.75)
+        assert (other.coach.strategy, other.coach.settings.beta) == ("adaptive", 0.75)
         assert other.model_copy(update={"coach": one.coach}) == one
 
 
@@ -57,22 +57,30 @@ def test_overrides_are_yaml_values_and_the_seed_wins() -> None:
     )
     assert (config.total_steps, config.learner.lr, config.seed) == (5000, 1e-3, 9)
     assert config.coach.victims == ("robot_2",)
-    assert load_train_config("buttons/adaptive", ["coach.rho=0.5"]).coach.strategy == "adaptive"
+    assert (
+        load_train_config("buttons/adaptive", ["coach.adaptive.rho=0.5"]).coach.strategy
+        == "adaptive"
+    )
 
 
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("coach.bta=1", r"--set coach\.bta=1: unknown key 'coach\.bta' \(did you mean 'beta'"),
+        (
+            "coach.beta=1",
+            r"--set coach\.beta=1: unknown key 'beta' of the coach \(did you mean 'adaptive\.beta'",
+        ),
+        ("coach.minalive=1", r"--set coach\.minalive=1: .*'minalive'.*did you mean 'min_alive'"),
         (
             "total_step=1",
             r"--set total_step=1: unknown key 'total_step' \(did you mean 'total_steps'",
         ),
         (
-            "coach.beta=1.5",
-            r"--set coach\.beta=1\.5: coach\.beta = 1\.5: .*less than or equal",
+            "coach.adaptive.beta=1.5",
+            r"--set coach\.adaptive\.beta=1\.5: strategy adaptive: setting beta = 1\.5: ",
         ),
-        ("coach.beta=.nan", r"--set coach\.beta=\.nan: coach\.beta = nan"),
+        ("coach.adaptive.beta=.nan", r"--set coach\.adaptive\.beta=\.nan: .*setting beta = nan"),
+        ("coach.adaptive.rho=true", r"setting rho = True: a number is needed"),
         ("n_envs=many", r"--set n_envs=many: n_envs = 'many'"),
         ("n_envs", r"--set n_envs: expected key=value"),
         ("=3", r"--set =3: expected key=value"),

@@ -99,7 +99,7 @@ def test_the_acting_policy_is_the_learners() -> None:
 
 
 def test_curriculum_crashes_robots_in_training_and_in_the_blocks(tmp_path: Path) -> None:
-    coach = {"strategy": "curriculum", "alpha_max": 0.8}
+    coach = {"strategy": "curriculum", "curriculum": {"alpha_max": 0.8}}
     train(small(coach=coach), tmp_path / "x")
     blocks = lines(tmp_path / "x")
     assert blocks[0]["crashed_fraction"] is None

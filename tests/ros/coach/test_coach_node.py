@@ -73,7 +73,7 @@ BAD_SETS: list[tuple[dict[str, object], str]] = [
     ({"victims": ["robot_1"], "crashed_exactly": 1}, "contradict"),
     ({"crash_rate": 0.4, "crash_mode": "explode"}, "crash_mode 'explode'"),
     ({"crash_rate": 0.4, "strategy": "wild"}, "unknown coaching strategy 'wild'"),
-    ({"crash_rate": 0.4, "rho": 0.0}, "rho 0.0"),
+    ({"crash_rate": 0.4, "adaptive.rho": 0.0}, "setting rho = 0.0"),
     ({"victim_role": "scout"}, "'scout'; one of: this team has no roles"),
     ({"hazard_rate_hz": 0.5}, "dt_s is unknown"),
     ({"near_point_m": [1.0]}, "near_point_m [1.0]: x and y in metres"),
@@ -99,7 +99,7 @@ def test_bad_parameters_are_refused_as_a_whole_with_the_reason(ros_env: dict[str
         before = setter.get(*names)
         for values, reason in BAD_SETS:
             # Something good in the same call must not be applied either.
-            answer = setter.set(**{"beta": 0.5, **values})
+            answer = setter.set(**{"adaptive.beta": 0.5, **values})
             assert reason.lower() in answer.lower(), (values, answer)
             assert setter.get(*names) == before, values
         t.announce(1, 0)
@@ -163,7 +163,12 @@ def test_an_injection_lasts_as_many_steps_as_asked(ros_env: dict[str, str]) -> N
 
 
 def test_adaptive_follows_complete_blocks_of_live_episodes(ros_env: dict[str, str]) -> None:
-    settings = {"strategy": "adaptive", "beta": 0.5, "rho": 0.25, "block_episodes": 2}
+    settings = {
+        "strategy": "adaptive",
+        "adaptive.beta": 0.5,
+        "adaptive.rho": 0.25,
+        "block_episodes": 2,
+    }
     with process(ros_env, "coach", robots=ROBOTS, **settings), team(ros_env) as t:
         t.meet(gate=False)
         rates = []
@@ -176,7 +181,7 @@ def test_adaptive_follows_complete_blocks_of_live_episodes(ros_env: dict[str, st
 
 
 def test_curriculum_follows_finished_episodes(ros_env: dict[str, str]) -> None:
-    settings = {"strategy": "curriculum", "alpha_max": 0.4, "curriculum_episodes": 4}
+    settings = {"strategy": "curriculum", "curriculum.alpha_max": 0.4, "curriculum.episodes": 4}
     with process(ros_env, "coach", robots=ROBOTS, **settings), team(ros_env) as t:
         t.meet(gate=False)
         rates = []

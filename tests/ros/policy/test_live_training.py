@@ -75,7 +75,7 @@ def trained(tmp_path: Path, layout: Layout, changes: dict[str, Any]) -> Path:
 def test_lock_step_over_ros_is_bit_for_bit_the_run_in_this_process(
     tmp_path: Path, layout: Layout, graphs: int
 ) -> None:
-    coach = {"strategy": "adaptive", "beta": 0.0, "rho": 0.4, "alpha_max": 0.9}
+    coach = {"strategy": "adaptive", "adaptive": {"beta": 0.0, "rho": 0.4, "alpha_max": 0.9}}
     changes = {"n_envs": graphs, "coach": coach}
     core = InProcess(small(seed=3, **changes))
     core.go()

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Literal, Self
 
 from crash_coach_common.contract import EnvSpec
-from crash_coach_pkg.coach.strategies import make_strategy
+from crash_coach_pkg.coach.strategies import find_strategy
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.live.order import Lockstep, Order, RealTime, Task
 from policy_pkg.train.live.session import LiveSession
@@ -30,8 +30,8 @@ def load_spec(config: TrainConfig) -> EnvSpec:
 
 
 def reads_blocks(config: TrainConfig) -> bool:
-    """Whether the coach's strategy needs the success rates of the run's blocks."""
-    return make_strategy(config.coach).needs_success
+    """Whether the coach's strategy reads the success rates of the run's blocks."""
+    return find_strategy(config.coach.strategy).reads_blocks
 
 
 class LiveRun:

@@ -6,9 +6,8 @@ nothing is guessed and no key is ignored.
 
 from __future__ import annotations
 
-import difflib
 import re
-from collections.abc import Hashable, Iterable, Iterator
+from collections.abc import Hashable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -17,23 +16,14 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from crash_coach_common.contract import UserError
+from crash_coach_common.wrong_key import Misplaced as Misplaced
+from crash_coach_common.wrong_key import did_you_mean as did_you_mean
 
 _Location = tuple[int | str, ...]
 
 
 class ConfigError(UserError):
     """A configuration that cannot be used; the text says where, what, and what is right."""
-
-
-class Misplaced(ValueError):
-    """For a model's checks of several keys together: what is wrong, and below which key.
-
-    ``location`` leads from the model that checks to the key or item that is to blame.
-    """
-
-    def __init__(self, location: _Location, text: str) -> None:
-        super().__init__(text)
-        self.location = location
 
 
 class StrictModel(BaseModel):
@@ -71,12 +61,6 @@ _Loader.add_implicit_resolver(
     re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"),
     list("-+0123456789."),
 )
-
-
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """ " (did you mean 'x'?)" for the closest known name, or nothing."""
-    close = difflib.get_close_matches(name, list(known), n=1)
-    return f" (did you mean {close[0]!r}?)" if close else ""
 
 
 def load_tree(path: Path) -> YamlTree:

@@ -138,10 +138,13 @@ def coach_parameters(options: UpOptions, team: TeamSpec) -> dict[str, Value]:
     if options.fault_scenario is not None:
         return {**parameters, "fault_scenario": str(options.fault_scenario.resolve())}
     chosen = config.model_dump(exclude_defaults=True, exclude_none=True)
+    chosen.pop(config.strategy, None)
+    given = config.settings.model_dump()
     checked = check_parameters(config.crash_mode, chosen.pop("crash_parameters", {}))
     mode = fault_mode(config.crash_mode).name
     of_mode = {f"{mode}.{k}": v for k, v in checked.model_dump(exclude_unset=True).items()}
-    return {**parameters, "strategy": config.strategy, **chosen, **of_mode}
+    of_strategy = {f"{config.strategy}.{key}": value for key, value in given.items()}
+    return {**parameters, "strategy": config.strategy, **chosen, **of_strategy, **of_mode}
 
 
 def relays_observations(options: UpOptions) -> bool:

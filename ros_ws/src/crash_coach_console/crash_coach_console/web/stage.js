@@ -44,7 +44,6 @@ export class Stage {
     setText(this.part(".title"), source.title);
     this.timeline = new Timeline(this.root, modes, (type, fields) => page.ask(this, type, fields));
     this.curves = new Curves(this.part(".curves"));
-    showCosts(this.part(".costs .rows"), []);
     this.listen();
     new ResizeObserver(() => this.resize()).observe(this.part(".arena"));
   }
@@ -86,7 +85,6 @@ export class Stage {
         this.camera = null;
         this.trails.clear();
         this.showRobots();
-        this.showStatus();
         this.label();
         break;
       case "state":
@@ -165,8 +163,7 @@ export class Stage {
     const { alive, title } = this.status;
     const live = this.kind === "graph";
     const paused = live && this.paused();
-    const scenario = live && this.arena?.scenario ? `${this.arena.scenario} · ` : "";
-    if (title) setText(this.part(".title"), `${scenario}${title}`);
+    if (title) setText(this.part(".title"), title);
     setText(this.part(".pause"), this.paused() ? (live ? "Go on" : "Play") : "Pause");
     const banner = this.part(".banner");
     const silent = live && !alive.sim && !alive.gate;

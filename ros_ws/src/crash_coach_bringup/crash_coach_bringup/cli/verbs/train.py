@@ -41,7 +41,7 @@ def train(
     out: Annotated[Path, typer.Option(help="Run directory; with several runs, their parent.")],
     override: Annotated[
         list[str] | None,
-        typer.Option("--set", help="key=value ...: replaces settings, e.g. coach.beta=0.7"),
+        typer.Option("--set", help="key=value ...: replaces settings, e.g. coach.strategy=deck"),
     ] = None,
     seed: Annotated[list[int] | None, typer.Option(help="Seed; several give several runs.")] = None,
     resume: Annotated[

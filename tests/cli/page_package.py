@@ -1,0 +1,41 @@
+"""A package that is not ours, installed beside Crash Coach, for the pages on adding things."""
+
+from __future__ import annotations
+
+import configparser
+import io
+import os
+import shlex
+import subprocess
+import tomllib
+from pathlib import Path
+
+from crash_coach_bringup.ros.probe import find_executable
+
+
+def install(folder: Path, path: str, source: str, project: str) -> None:
+    """What installing the project leaves: its module at ``path``, and what its metadata says."""
+    module = folder / path
+    module.parent.mkdir(parents=True)
+    module.with_name("__init__.py").touch()
+    module.write_text(source)
+    settings = tomllib.loads(project)["project"]
+    info = folder / f"{settings['name'].replace('-', '_')}-{settings['version']}.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {settings['name']}\nVersion: {settings['version']}\n"
+    )
+    points = configparser.ConfigParser()
+    points.read_dict(settings["entry-points"])
+    text = io.StringIO()
+    points.write(text)
+    (info / "entry_points.txt").write_text(text.getvalue())
+
+
+def crash_coach(folder: Path, line: str, *more: str) -> subprocess.CompletedProcess[str]:
+    """Types a page's command where the package in ``folder`` is installed."""
+    program, *arguments = shlex.split(line)
+    command = [str(find_executable("crash_coach_bringup", program)), *arguments, *more]
+    paths = [str(folder), os.environ.get("PYTHONPATH", "")]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    return subprocess.run(command, capture_output=True, text=True, timeout=90, env=env)

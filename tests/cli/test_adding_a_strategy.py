@@ -1,0 +1,86 @@
+"""docs/adding_a_strategy.md, followed to the letter: a strategy of a package that is not ours."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from page_package import crash_coach, install
+
+PAGE = (Path(__file__).resolve().parents[2] / "docs/adding_a_strategy.md").read_text()
+RUN = "runs/weakest"
+
+
+def block(language: str) -> str:
+    """The page's only block in that language."""
+    (found,) = re.findall(rf"```{language}\n(.*?)```", PAGE, flags=re.DOTALL)
+    return str(found)
+
+
+def installed(folder: Path, project: str) -> Path:
+    (path,) = re.findall(r"The strategy, `(\S+\.py)`", PAGE)
+    install(folder, path, block("python"), project)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return installed(tmp_path_factory.mktemp("site"), block("toml"))
+
+
+def test_the_strategy_trains_as_the_page_says(package: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    done = crash_coach(package, block("bash").strip().replace(RUN, shlex.quote(str(run))))
+    assert done.returncode == 0, done.stderr
+    described = json.loads((run / "run.json").read_text())["config"]["coach"]
+    assert (described["strategy"], described["weakest"]) == ("weakest", {"every": 3})
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert [line["alpha"] for line in lines] == [pytest.approx(1 / 6)] * 4
+    # One robot of two in a third of the episodes, of which there were some 150.
+    fractions = [line["crashed_fraction"] for line in lines[1:]]
+    assert sum(fractions) / 3 == pytest.approx(1 / 6, abs=0.08)
+    (checkpoint,) = (run / "checkpoints").iterdir()
+    state = json.loads((checkpoint / "checkpoint.json").read_text())["training"]["coach"]
+    worst = min("robot_1", "robot_2", key=lambda name: lines[-1][f"success_{name}_crashed"])
+    assert state["strategy"] == {"robot": int(worst[-1]) - 1}
+
+
+def test_its_settings_are_checked(package: Path, tmp_path: Path) -> None:
+    line = block("bash").strip().replace(RUN, shlex.quote(str(tmp_path / "run")))
+    for wrong, text in (
+        ("every=0", "strategy weakest: setting every = 0: Input should be greater"),
+        ("evry=3", "unknown setting 'evry' (did you mean 'every'?)"),
+    ):
+        done = crash_coach(package, line.replace("every=3", wrong))
+        assert done.returncode != 0
+        assert text in " ".join(done.stderr.split())
+        assert "Traceback" not in done.stderr
+
+
+def test_without_the_package_the_strategy_is_unknown(tmp_path: Path) -> None:
+    line = block("bash").strip().replace(RUN, shlex.quote(str(tmp_path / "run")))
+    done = crash_coach(tmp_path, line)
+    assert done.returncode != 0
+    assert "unknown key 'weakest' of the coach" in " ".join(done.stderr.split())
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ("weakest:Weakest", "weakest:Weekest", "has no attribute 'Weekest'"),
+        ("weakest:Weakest", "weakest:WeakestSettings", "is not a Strategy"),
+    ],
+)
+def test_a_broken_entry_point_is_named(tmp_path: Path, old: str, new: str, text: str) -> None:
+    site = installed(tmp_path / "site", block("toml").replace(old, new))
+    line = block("bash").strip().replace(RUN, shlex.quote(str(tmp_path / "run")))
+    done = crash_coach(site, line)
+    assert done.returncode != 0
+    said = " ".join(done.stderr.split())
+    assert "entry point weakest" in said
+    assert "my-strategies" in said
+    assert text in said
+    assert "Traceback" not in done.stderr
