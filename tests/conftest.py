@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Iterator
 
 import pytest
 
 from crash_coach_bringup.ros import discovery
 from crash_coach_bringup.ros.domain import reserve_domain
+
+# Where the suite runs in the background of a shell, Ctrl-C is ignored, by all that it starts too.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture

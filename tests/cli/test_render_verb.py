@@ -142,7 +142,6 @@ def test_a_wrong_scripted_team_is_named() -> None:
     assert "does not play scenario 'buttons'" in refused(
         "evaluate", "scripted:nearest", "--scenario", "buttons"
     )
-    assert "--via ros" in refused("evaluate", *RANDOM, "--via", "ros")
 
 
 def test_calibrate_counts_wins_and_losses(tmp_path: Path) -> None:

@@ -27,7 +27,9 @@ def run(
     folder.mkdir(parents=True)
     text = "".join(json.dumps(row) + "\n" for row in rows)
     (folder / "metrics.jsonl.gz").write_bytes(gzip.compress(text.encode()))
-    return Run(folder, folder / "checkpoints/step_100", "qmix", scenario, seed, {}, 100, 100, "")
+    return Run(
+        folder, folder / "checkpoints/step_100", "qmix", scenario, seed, {}, 100, 100, "", scenario
+    )
 
 
 def block(steps: int, success: float | None, axis: str = "env_steps") -> dict[str, float | None]:

@@ -81,7 +81,7 @@ def test_parameters_and_duration_of_a_crash(player: Player) -> None:
     asked = inject("robot_3", mode="delay", parameters={"steps": 3.0}, duration_steps=5)
     crashed, _ = player.crash(film, asked, 4)
     assert crashed.stretches == [{"robot": "robot_3", "mode": "delay", "from": 4, "to": 9}]
-    with pytest.raises(UserError, match="crash mode delay: parameter stps"):
+    with pytest.raises(UserError, match="crash mode delay: no parameter 'stps'"):
         player.crash(film, inject("robot_3", mode="delay", parameters={"stps": 3.0}), 4)
     with pytest.raises(UserError, match="values least"):
         player.crash(film, inject("robot_3", mode="adversarial"), 4)  # a script values nothing

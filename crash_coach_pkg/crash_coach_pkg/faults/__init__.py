@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from crash_coach_common.contract import UserError
 from crash_coach_common.plugins import load, place
-from crash_coach_common.strict_yaml import did_you_mean
+from crash_coach_common.wrong_key import did_you_mean
 from crash_coach_pkg.faults.adversarial import Adversarial
 from crash_coach_pkg.faults.base import (
     CommandFault,

@@ -8,19 +8,13 @@ from pathlib import Path
 from crash_coach_common.contract import UserError
 from policy_pkg.checkpoint import PolicyBundle, load_policy
 from policy_pkg.play.evaluate import Scripted
+from policy_pkg.team_name import scripted_name
 from policy_pkg.train.run_dir import found_now, scenario_of
 from sim_pkg.env import ScenarioLike, make_any_env
 from sim_pkg.foreign.config import PREFIX, EnvRules
 from sim_pkg.scenario_source import ScenarioSource, read_scenario
 
-SCRIPTED = "scripted:"
 HELP = "Run directory (RUN@best: its best checkpoint), checkpoint directory, or scripted:NAME."
-
-
-def scripted_name(team: str | Path) -> str | None:
-    """NAME of ``scripted:NAME``; None for a trained team."""
-    text = str(team)
-    return text.removeprefix(SCRIPTED) if text.startswith(SCRIPTED) else None
 
 
 @dataclass(frozen=True)

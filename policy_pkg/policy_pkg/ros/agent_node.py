@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import TYPE_CHECKING
 
 from crash_coach_interfaces.msg import Action, Observation
 from rclpy.context import Context
@@ -16,11 +17,13 @@ from crash_coach_common.ros.run_node import run, serving
 from policy_pkg.act import Exploration, greedy, least_valued
 from policy_pkg.agent import Agent
 from policy_pkg.checkpoint import load_policy
-from policy_pkg.play.scripted_agent import ScriptedAgent
-from policy_pkg.play.target import scripted_name
 from policy_pkg.ros.agent_params import PolicyParameters, TeamParameters, read_parameters
 from policy_pkg.ros.convert import bytes_from_answer, sensed_from_bytes
 from policy_pkg.ros.weights_link import Receive, WeightsLink
+from policy_pkg.team_name import scripted_name
+
+if TYPE_CHECKING:
+    from policy_pkg.play.scripted_agent import ScriptedAgent
 
 
 class AgentNode(Node):
@@ -82,6 +85,9 @@ def make_agent(
     scripted = scripted_name(parameters.checkpoint)
     agent: Agent[bytes] | ScriptedAgent[bytes]
     if scripted is not None:
+        # It reads its observations as the simulator lays them out; a trained team does without.
+        from policy_pkg.play.scripted_agent import ScriptedAgent
+
         agent = ScriptedAgent(scripted, parameters.scenario, robots, seed)
         n_robots = agent.n_robots
     else:

@@ -7,7 +7,7 @@ from rclpy.node import Node
 
 from crash_coach_common.contract import UserError
 from crash_coach_common.ros.parameters import read_model, require
-from policy_pkg.play.target import scripted_name
+from policy_pkg.team_name import scripted_name
 
 _WITHOUT_LIVE = ("checkpoint", "epsilon", "exploration_seed")
 

@@ -52,7 +52,7 @@ def file_of(*entries: str, expect: str = "") -> str:
         (
             file_of("crash_mode: delay\n    crash_parameters: {step: 1}"),
             4,
-            "parameter step = .*its parameters: steps",
+            r"no parameter 'step' \(did you mean 'steps'\?\) \(its parameters: steps\)",
         ),
         (file_of("victims: [robot_1, robot_1]"), 3, "robot_1 more than once"),
         (file_of("{hazard_rate_hz: 1, return_above: 3}"), 3, "contradict each other"),

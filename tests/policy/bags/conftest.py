@@ -1,16 +1,5 @@
-"""One short recording's episodes and messages for every test; made once."""
+"""One short recording's episodes and messages, as its tests want them."""
 
-from __future__ import annotations
+from bag_fixtures import made, team
 
-import pytest
-from bag_maker import Made, Team, played
-
-
-@pytest.fixture(scope="session")
-def team() -> Team:
-    return Team()
-
-
-@pytest.fixture(scope="session")
-def made(team: Team) -> list[Made]:
-    return played(team, 6)
+__all__ = ["made", "team"]

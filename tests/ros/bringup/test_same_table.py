@@ -65,7 +65,7 @@ def test_the_same_table_however_it_is_played(table: Callable[..., Table], crash:
     lines, conditions = once
     assert "trajectory hash" in lines[-1]
     assert [c["name"] for c in conditions] == (
-        ["rate 0.3", "1 crashed"] if crash else ["crash-free"]
+        ["crash-free", "rate 0.3", "1 crashed"] if crash else ["crash-free"]
     )
     for condition in conditions:
         rows = condition["per_episode"]

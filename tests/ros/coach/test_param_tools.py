@@ -33,7 +33,7 @@ def test_what_was_dumped_can_be_loaded_in_any_order(
         fresh = dump(g.operator)
         changed = {
             "victims": [ROBOTS[1]], "crash_mode": "delay", "delay.steps": 7, "min_alive": 1,
-            "strategy": "adaptive", "beta": 0.5,
+            "strategy": "adaptive", "adaptive.beta": 0.5,
         }  # fmt: skip
         assert not g.operator.set(**changed)
         assert g.operator.clear().success  # victims, and enabled is false
@@ -49,13 +49,13 @@ def test_what_was_dumped_can_be_loaded_in_any_order(
 
 def alone(g: Graph, folder: Path) -> None:
     """What cannot be loaded has a reason of its own, and the rest is loaded all the same."""
-    parameters = {"dt_s": 0.2, "beta": 0.25, "crash_rate": 7.0, "rho": 0.5}
+    parameters = {"dt_s": 0.2, "adaptive.beta": 0.25, "crash_rate": 7.0, "adaptive.rho": 0.5}
     told = load(g.operator, folder / "wrong.yaml", parameters)
     assert {name: done for name, (done, _) in told.items()} == {
-        "dt_s": False, "beta": True, "crash_rate": False, "rho": True,
+        "dt_s": False, "adaptive.beta": True, "crash_rate": False, "adaptive.rho": True,
     }  # fmt: skip
     assert "read-only" in told["dt_s"][1]
-    assert g.operator.get("beta", "rho") == [0.25, 0.5]
+    assert g.operator.get("adaptive.beta", "adaptive.rho") == [0.25, 0.5]
 
 
 def test_enumerated_parameters_are_described_with_their_choices(ros_env: dict[str, str]) -> None:

@@ -80,12 +80,13 @@ def shown(number: int, name: str, scenario: str | None, seed: int) -> Source:
     from crash_coach_console.recording import Recording
     from crash_coach_console.run_source import RunSource
     from policy_pkg.bags.bag import is_recording
-    from policy_pkg.play.target import SCRIPTED, load_target
+    from policy_pkg.play.target import load_target
     from policy_pkg.report.finished_runs import has_begun
+    from policy_pkg.team_name import scripted_name
     from policy_pkg.train.run_dir import RUN
 
     path = Path(name)
-    if not name.startswith(SCRIPTED):
+    if scripted_name(name) is None:
         if is_recording(path):
             return EpisodeSource(number, Recording(path, scenario))
         if (path / RUN).is_file() and not has_begun(path):

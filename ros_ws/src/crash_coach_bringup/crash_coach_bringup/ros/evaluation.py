@@ -28,7 +28,7 @@ from crash_coach_pkg.faults.action_tools import ACTION_OFFERS
 from crash_coach_pkg.faults.base import Need
 from policy_pkg.play.conditions import Condition
 from policy_pkg.play.evaluate import Evaluation
-from policy_pkg.play.target import scripted_name
+from policy_pkg.team_name import scripted_name
 
 
 def evaluate_via_ros(

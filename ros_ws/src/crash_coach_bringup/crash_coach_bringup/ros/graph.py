@@ -18,7 +18,7 @@ from crash_coach_pkg.coach.config import CoachConfig, FaultConfig, TeamSpec
 from crash_coach_pkg.coach.fault_scenario import load_fault_scenario
 from crash_coach_pkg.faults import check_parameters, fault_mode, is_observation_mode
 from policy_pkg.checkpoint import load_policy
-from policy_pkg.play.target import scripted_name
+from policy_pkg.team_name import scripted_name
 from sim_pkg.env import make_env
 from sim_pkg.scripted import make_scripted
 
