@@ -162,7 +162,11 @@ def test_a_rule_for_the_plan_moves_both_its_ends(ros_env: dict[str, str]) -> Non
     ):
         assert not setter.set(victims=["a"], crash_mode="mute")  # the gate has armed it
         node = client.node
-        assert node.count_publishers("/x/plan") == node.count_subscribers("/x/plan") == 1
+
+        def both() -> bool:
+            return node.count_publishers("/x/plan") == node.count_subscribers("/x/plan") == 1
+
+        client.until(both, WAIT_S, "both ends of /x/plan")
         assert node.count_publishers("/coach/plan") == node.count_subscribers("/coach/plan") == 0
 
 
