@@ -186,7 +186,8 @@ def test_param_set(folder: Path, env: dict[str, str], start: str) -> None:
 
 def test_train_and_evaluate(folder: Path, env: dict[str, str]) -> None:
     output = typed(folder, [". ./env.sh", *block("crash-coach doctor")], env)
-    assert output.count("trajectory hash") == 2
+    evaluations = [line for line in block("crash-coach doctor") if " evaluate " in line]
+    assert output.count("trajectory hash") == len(evaluations) == 3
     assert (folder / "runs" / "mine.json").exists()
 
 
