@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from typing import Any
 
 from pydantic import ValidationError
 
 from crash_coach_common.contract import UserError
+from crash_coach_common.plugins import load, place
 from crash_coach_common.wrong_key import Misplaced, did_you_mean
 from crash_coach_pkg.coach.strategies.adaptive import Adaptive
 from crash_coach_pkg.coach.strategies.base import Candidates, Strategy, StrategySettings
@@ -61,30 +62,17 @@ def _known() -> dict[str, type[AnyStrategy]]:
     if not _installed_read:
         found = dict(_strategies)
         for point in entry_points(group=ENTRY_POINT_GROUP):
-            strategy = _load(point)
+            strategy: type[AnyStrategy] = load(point)
             if strategy in found.values():  # registered before
                 continue
             try:
                 _check(strategy, found)
             except ValueError as error:
-                raise UserError(f"{_place(point)} cannot be used: {error}") from error
+                raise UserError(f"{place(point)} cannot be used: {error}") from error
             found[strategy.name] = strategy
         _strategies.update(found)
         _installed_read = True
     return _strategies
-
-
-def _load(point: EntryPoint) -> type[AnyStrategy]:
-    try:
-        strategy: type[AnyStrategy] = point.load()
-    except (ImportError, AttributeError) as error:
-        raise UserError(f"{_place(point)} cannot be loaded: {error}") from error
-    return strategy
-
-
-def _place(point: EntryPoint) -> str:
-    package = point.dist.name if point.dist is not None else "an unknown package"
-    return f"entry point {point.name} = {point.value} ({ENTRY_POINT_GROUP}) of {package}"
 
 
 def strategy_names() -> tuple[str, ...]:
