@@ -6,6 +6,7 @@ import math
 import os
 import signal
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 from coach_graph import ROBOTS, Graph, Team, graph, operator, process, run_to_end, team
@@ -13,6 +14,7 @@ from crash_coach_interfaces.msg import CrashPlan, FaultEvent
 
 from crash_coach_pkg.coach.coach import Coach
 from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.live_coach import Control, ControlSettings
 from crash_coach_pkg.coach.parameters import START_SPECS, parameter_specs
 
 
@@ -86,7 +88,8 @@ BAD_SETS: list[tuple[dict[str, object], str]] = [
     ({"lease_s": 0.0}, "out of range"),
     ({"seed": -1}, "out of range"),
     ({"robots": ["robot_1"]}, "read-only"),
-    ({"nonsense": 1}, "undeclared parameter"),
+    ({"nonsense": 1}, "coach has no parameter 'nonsense'"),
+    ({"deck.tow": 1}, "has no parameter 'deck.tow' (did you mean 'deck.two'?)"),
 ]
 
 
@@ -190,6 +193,48 @@ def test_curriculum_follows_finished_episodes(ros_env: dict[str, str]) -> None:
             rates.append(plan_of(t, episode).rate)
             t.announce(episode, 1, ended=True)
         assert rates == pytest.approx([0, 0.1, 0.2, 0.3, 0.4, 0.4])
+
+
+@pytest.mark.parametrize(
+    ("strategy", "changed"),
+    [
+        ("deck", {"deck.one": 4}),
+        ("learnability", {"learnability.even": 0.25}),
+        ("failure", {"failure.floor": 0.3}),
+    ],
+)
+def test_who_is_chosen_follows_the_episodes_that_were_seen(
+    ros_env: dict[str, str], strategy: str, changed: dict[str, Any]
+) -> None:
+    """Live episodes teach the coach's own memory, as the trainer's do; a setting that changes in
+    between counts from the next episode, and what was learned stays."""
+    settings = {"strategy": strategy, "min_alive": 1}
+    control = Control(
+        ControlSettings(seed=11, coach=CoachConfig(**settings)), TeamSpec(ROBOTS), revision=0
+    )
+    seen = []
+    with process(ros_env, "coach", robots=ROBOTS, seed=11, **settings) as _, team(ros_env) as t:
+        t.meet(gate=False)
+        with operator(ros_env) as setter:
+            for episode in range(24):
+                if episode == 12:
+                    assert not setter.set(**changed)
+                    config = CoachConfig(
+                        **settings, **{strategy: {k.split(".")[1]: v for k, v in changed.items()}}
+                    )
+                    control.configure(ControlSettings(seed=11, coach=config), now=False)
+                t.announce(episode, 0)
+                expected = control.follow(episode)
+                assert expected is not None
+                crashed = [ROBOTS[fault.robot] for fault in expected.faults]
+                plan = plan_of(t, episode)
+                assert victims(plan) == crashed, episode
+                assert plan.rate == pytest.approx(control.rate)
+                success = "robot_1" not in crashed
+                t.announce(episode, 1, ended=True, success=success)
+                control.finish(success)
+                seen.append(tuple(crashed))
+    assert {(), ("robot_1",), ("robot_2",), ("robot_1", "robot_2")} <= set(seen)
 
 
 def test_a_coach_that_starts_in_mid_episode_plans_it(ros_env: dict[str, str]) -> None:

@@ -1,7 +1,7 @@
 """A node's parameters: served, and declared from a strict model that validates them.
 
-rclpy's own services let a type through that does not exist, which ends the node, and make a
-parameter without a name. Here both are refused.
+rclpy's own services let a type through that does not exist, which ends the node, make a parameter
+without a name, and do not say which name is not declared. Here all three are refused by name.
 """
 
 from __future__ import annotations
@@ -113,9 +113,9 @@ class CheckedParameterService(ParameterService):
         self, request: SetParameters.Request, response: SetParameters.Response
     ) -> SetParameters.Response:
         wanted = [p for p in request.parameters if not self._read_only(p.name)]
-        together = len(wanted) > 1 and _refusal(wanted) is None and self._set_together(wanted)
+        together = len(wanted) > 1 and self._refusal(wanted) is None and self._set_together(wanted)
         for parameter in request.parameters:
-            refusal = _refusal([parameter])
+            refusal = self._refusal([parameter])
             if refusal is not None:
                 response.results.append(refusal)
             elif together and not self._read_only(parameter.name):
@@ -141,20 +141,23 @@ class CheckedParameterService(ParameterService):
         request: SetParametersAtomically.Request,
         response: SetParametersAtomically.Response,
     ) -> SetParametersAtomically.Response:
-        refusal = _refusal(request.parameters)
+        refusal = self._refusal(request.parameters)
         if refusal is None:
             return super()._set_parameters_atomically_callback(request, response)
         response.result = refusal
         return response
 
-
-def _refusal(parameters: Iterable[ParameterMessage]) -> SetParametersResult | None:
-    for parameter in parameters:
-        reason = ""
-        if not parameter.name:
-            reason = "a parameter has no name"
-        elif parameter.value.type > LAST_TYPE:
-            reason = f"parameter {parameter.name}: {parameter.value.type} is no parameter type"
-        if reason:
-            return SetParametersResult(successful=False, reason=reason)
-    return None
+    def _refusal(self, parameters: Iterable[ParameterMessage]) -> SetParametersResult | None:
+        node = self._get_node()
+        for parameter in parameters:
+            reason, name = "", parameter.name
+            if not name:
+                reason = "a parameter has no name"
+            elif parameter.value.type > LAST_TYPE:
+                reason = f"parameter {name}: {parameter.value.type} is no parameter type"
+            elif not node.has_parameter(name):
+                near = did_you_mean(name, sorted(node._parameters))
+                reason = f"{node.get_name()} has no parameter {name!r}{near}"
+            if reason:
+                return SetParametersResult(successful=False, reason=reason)
+        return None
