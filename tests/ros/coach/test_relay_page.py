@@ -6,10 +6,12 @@ import os
 import re
 import signal
 import subprocess
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+import pytest
 from coach_graph import operator, process
 from coach_operator import WAIT_S
 from crash_coach_interfaces.msg import FaultEvent
@@ -30,8 +32,12 @@ def section() -> str:
 
 
 def commands(verb: str) -> list[str]:
-    (block,) = re.findall(r"```bash\n(.*?)```", section(), flags=re.DOTALL)
-    return [line for line in block.splitlines() if line.startswith(f"ros2 {verb} ")]
+    return [line for block in blocks() for line in block if line.startswith(f"ros2 {verb} ")]
+
+
+def blocks() -> list[list[str]]:
+    found = re.findall(r"```bash\n(.*?)```", section(), flags=re.DOTALL)
+    return [block.strip().splitlines() for block in found]
 
 
 @contextmanager
@@ -74,6 +80,115 @@ def test_the_commands_of_the_page_inject_and_clear(ros_env: dict[str, str]) -> N
         )
     active = [(e.robot, e.mode) for e in events if e.kind == FaultEvent.ACTIVE]
     assert active == [("rover_1", "delay")]
+
+
+class Shell:
+    """A shell in which a reader types commands, in a checkout of links."""
+
+    def __init__(self, folder: Path, env: dict[str, str], commands: list[str], log: Path) -> None:
+        self._log = log
+        with open(log, "w") as out:
+            script = "\n".join(["set -eo pipefail", *commands])
+            self.child = subprocess.Popen(
+                ["bash", "-c", script],
+                cwd=folder,
+                env=env,
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+
+    def said(self) -> list[str]:
+        return self._log.read_text().splitlines()
+
+    def until(self, line: str, count: int = 1) -> None:
+        end = time.monotonic() + WAIT_S
+        while self.said().count(line) < count:
+            assert time.monotonic() < end, f"not {count} times {line!r}: {self.said()}"
+            assert self.child.poll() is None, f"it ended: {self.said()}"
+            time.sleep(0.05)
+
+    def close(self) -> None:
+        """As Ctrl-C does."""
+        try:
+            if self.child.poll() is None:
+                os.killpg(self.child.pid, signal.SIGINT)
+            self.child.wait(timeout=WAIT_S)
+        finally:
+            if self.child.poll() is None:
+                os.killpg(self.child.pid, signal.SIGKILL)
+                self.child.wait(timeout=WAIT_S)
+
+
+def test_a_reader_without_a_distribution_types_the_page(
+    ros_env: dict[str, str], tmp_path: Path
+) -> None:
+    """In its order, each block in a shell of its own, on a fresh graph."""
+    folder = tmp_path / "checkout"
+    folder.mkdir()
+    for entry in ROOT.iterdir():
+        if entry.name not in ("runs", ".git"):
+            (folder / entry.name).symlink_to(entry)
+    robots, gate, inject, _ = blocks()
+    with ExitStack() as stack:
+        rovers = Shell(folder, ros_env, robots, tmp_path / "rovers.txt")
+        stack.callback(rovers.close)
+        rovers.until("rover_2 stands")
+        assert rovers.said() == ["rover_1 stands", "rover_2 stands"]
+        relaying = Shell(folder, ros_env, gate, tmp_path / "gate.txt")
+        stack.callback(relaying.close)
+        rovers.until("rover_1 drives at 0.2 m/s")
+        rovers.until("rover_2 drives at 0.2 m/s")
+        relaying.until("gate: ready: crash-coach inject --victims rover_1 --mode mute")
+
+        env_sh, mute, scale, clear = inject
+        assert typed(folder, ros_env, [env_sh, mute]) == "rover_1: mute from the next step on"
+        rovers.until("rover_1 stands", 2)
+        relaying.until("rover_1: muted by plan (mute)")
+        typed(folder, ros_env, [env_sh, scale])
+        rovers.until("rover_1 drives at 0.2 m/s", 2)
+        rovers.until("rover_2 drives at 0.1 m/s")
+        typed(folder, ros_env, [env_sh, clear])
+        rovers.until("rover_2 drives at 0.2 m/s", 2)
+        relaying.close()
+        assert relaying.child.returncode == 130
+        last = f"gate: stopped: no process is left on domain {ros_env['ROS_DOMAIN_ID']}"
+        assert relaying.said()[-1] == last
+        rovers.until("rover_1 stands", 3)
+
+
+def typed(folder: Path, env: dict[str, str], commands: list[str]) -> str:
+    done = subprocess.run(
+        ["bash", "-c", "\n".join(["set -eo pipefail", *commands])],
+        cwd=folder,
+        env=env,
+        capture_output=True,
+        text=True,
+        timeout=WAIT_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout.strip()
+
+
+@pytest.mark.parametrize(
+    ("robots", "reason"), [("2nd", "robot name '2nd'"), ("a a", "robots names 'a' more than once")]
+)
+def test_names_that_are_none_are_refused_before_anything_starts(
+    ros_env: dict[str, str], tmp_path: Path, robots: str, reason: str
+) -> None:
+    logs = tmp_path / "logs"
+    done = subprocess.run(
+        ["crash-coach", "gate", "--robots", *robots.split(), "--logs", str(logs)],
+        env=ros_env,
+        capture_output=True,
+        text=True,
+        timeout=WAIT_S,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"crash-coach: error: {reason}")
+    assert not logs.exists()
 
 
 def test_the_table_lists_every_parameter_of_the_gate(ros_env: dict[str, str]) -> None:

@@ -23,6 +23,7 @@ from crash_coach_bringup.cli.verbs import (
     demo,
     doctor,
     evaluate,
+    gate,
     inject,
     plot,
     profile,
@@ -55,6 +56,7 @@ app.command("profile")(profile.profile)
 app.add_typer(faults.app, name="faults")
 app.command("up")(up.up)
 app.command("inject")(inject.inject)
+app.command("gate")(gate.gate)
 app.command("console")(console)
 app.command("record")(record.record)
 app.add_typer(bags.app, name="bags")

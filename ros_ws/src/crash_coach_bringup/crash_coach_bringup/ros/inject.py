@@ -111,4 +111,5 @@ def _clear(client: GraphClient, timeout_s: float, no_coach: str) -> str:
 def _no_coach(domain: int | None, namespace: str) -> str:
     shown = os.environ.get("ROS_DOMAIN_ID", "0") if domain is None else domain
     name = f"{checked_namespace(namespace)}/{COACH}"
-    return f"a node {name} on ROS domain {shown}; start one with 'crash-coach up'"
+    start = "start one with 'crash-coach up' or 'crash-coach gate'"
+    return f"a node {name} on ROS domain {shown}; {start}"

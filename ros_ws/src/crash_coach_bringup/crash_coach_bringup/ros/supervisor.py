@@ -44,7 +44,10 @@ class Ended:
 class Event:
     """What happened, for whoever shows it to the user."""
 
-    kind: Literal["started", "episode", "died", "finished", "interrupted", "summary", "stopped"]
+    kind: Literal[
+        "started", "ready", "robot", "episode", "died", "finished", "interrupted", "summary",
+        "stopped",
+    ]  # fmt: skip
     process: str
     text: str
 

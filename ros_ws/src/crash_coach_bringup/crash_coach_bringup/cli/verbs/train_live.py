@@ -13,10 +13,10 @@ from crash_coach_bringup.cli.jobs import tell_stopped
 from crash_coach_bringup.cli.options import Mode
 from crash_coach_bringup.cli.output import CliError, console
 from crash_coach_bringup.cli.signals import exit_code
+from crash_coach_bringup.cli.supervised import teller
 
 if TYPE_CHECKING:
     from crash_coach_bringup.ros.graph import Layout
-    from crash_coach_bringup.ros.supervisor import Event
 
 
 class Processes(StrEnum):
@@ -30,12 +30,6 @@ LAYOUTS: dict[Processes, Layout] = {
     Processes.team: "team",
     Processes.nodes: "nodes",
 }
-
-
-def show(event: Event) -> None:
-    """One line per event; a death goes to stderr with the end of the node's log."""
-    words = [word for word in (event.kind, event.process, event.text) if word]
-    typer.echo(f"train-live: {': '.join(words)}", err=event.kind == "died")
 
 
 def train_live(
@@ -77,7 +71,7 @@ def train_live(
         layout=LAYOUTS[layout],
         log_dir=logs,
     )
-    code = run_live(options, show, typer.echo)
+    code = run_live(options, teller("train-live"), typer.echo)
     if code == exit_code(SIGINT):
         console.print(tell_stopped(out), markup=False, highlight=False, soft_wrap=True)
     raise typer.Exit(code)

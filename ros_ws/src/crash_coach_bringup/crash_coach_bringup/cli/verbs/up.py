@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from crash_coach_bringup.cli.options import Layout, LayoutOption, Mode, NamespaceOption
-from crash_coach_bringup.cli.output import CliError, not_written
+from crash_coach_bringup.cli.output import CliError
+from crash_coach_bringup.cli.supervised import logs_at, teller
 from crash_coach_console.serve import PORT
 from policy_pkg.play.conditions import at_rate
 from policy_pkg.play.target import HELP
-
-if TYPE_CHECKING:
-    from crash_coach_bringup.ros.supervisor import Event
-
 
 RelayOption = Annotated[
     bool,
@@ -30,24 +25,6 @@ ConsoleOption = Annotated[bool, typer.Option("--console", help="Also serve the t
 PortOption = Annotated[
     int, typer.Option(help="Port of the page, with --console.", min=1, max=65535)
 ]
-
-
-def show(event: Event) -> None:
-    """One line per event; a death goes to stderr with the end of the node's log."""
-    if event.kind in ("episode", "summary"):
-        typer.echo(event.text)
-        return
-    words = [word for word in (event.kind, event.process, event.text) if word]
-    typer.echo(f"up: {': '.join(words)}", err=event.kind == "died")
-
-
-@contextmanager
-def logs_at(folder: Path) -> Iterator[None]:
-    """Raises CliError where the body could not write its logs."""
-    try:
-        yield
-    except OSError as error:
-        raise CliError(not_written("--logs", folder, error)) from None
 
 
 def up(
@@ -98,4 +75,4 @@ def up(
         namespace=namespace,
     )
     with logs_at(logs):
-        raise typer.Exit(run_up(options, show, port if console else None))
+        raise typer.Exit(run_up(options, teller("up"), port if console else None))
