@@ -12,6 +12,7 @@ setup(
     packages=[
         "policy_pkg",
         "policy_pkg.bags",
+        "policy_pkg.export",
         "policy_pkg.learner",
         "policy_pkg.learner.native",
         "policy_pkg.play",
@@ -29,6 +30,8 @@ setup(
         (f"share/{package}", ["package.xml"]),
     ],
     install_requires=["setuptools"],
+    # What a policy node or a program of one's own acts with; rclpy comes with ROS.
+    extras_require={"acting": ["numpy", "pydantic", "safetensors"]},
     zip_safe=False,
     entry_points={
         "console_scripts": [

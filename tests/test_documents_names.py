@@ -23,6 +23,7 @@ ELSEWHERE = {
     "my_faults/hiccup.py",
     "my_strategies/weakest.py",
     "best/",
+    "policy.pt",
     "return_1_crashed",
     "robot_n",
 }

@@ -23,6 +23,7 @@ from crash_coach_bringup.cli.verbs import (
     demo,
     doctor,
     evaluate,
+    export,
     gate,
     inject,
     plot,
@@ -64,6 +65,7 @@ app.command("demo")(demo.demo)
 app.command("plot")(plot.plot)
 app.command("collect")(collect.collect)
 app.command("report")(report.report)
+app.command("export")(export.export)
 app.command("render")(render.render)
 app.command("calibrate")(calibrate.calibrate)
 app.command("check-scenario")(check_scenario.check_scenario)
