@@ -22,12 +22,24 @@ def draw_victims(config: FaultConfig, team: TeamSpec, rng: np.random.Generator) 
     if config.victims:
         return np.array([name in config.victims for name in team.robots])
     candidates = team.of_role(config.victim_role)
-    count = len(candidates)
-    if config.crashed_exactly >= 0:
-        count = config.crashed_exactly
-    elif not config.triggered:
-        count = min(count, most_crashed(config, team.n))
+    count = _victim_count(config, team)
     return among(candidates, team.n, draw_exactly(rng, len(candidates), count))
+
+
+def _victim_count(config: FaultConfig, team: TeamSpec) -> int:
+    """How many of the candidates a draw of victims takes."""
+    candidates = len(team.of_role(config.victim_role))
+    if config.crashed_exactly >= 0:
+        return config.crashed_exactly
+    return candidates if config.triggered else min(candidates, most_crashed(config, team.n))
+
+
+def left_to_chance(config: FaultConfig, team: TeamSpec) -> bool:
+    """Whether draws say whom it strikes, when, or how: then episodes differ by them."""
+    if config.hazard_rate_hz > 0 or fault_mode(config.crash_mode).draws:
+        return True
+    candidates = len(team.of_role(config.victim_role))
+    return not config.victims and 0 < _victim_count(config, team) < candidates
 
 
 def among(candidates: tuple[int, ...], n: int, mask: BoolArray) -> BoolArray:

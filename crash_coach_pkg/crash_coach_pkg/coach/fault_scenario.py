@@ -22,7 +22,13 @@ from crash_coach_common.strict_yaml import (
     validate,
 )
 from crash_coach_pkg.coach.config import FaultConfig, TeamSpec
-from crash_coach_pkg.coach.draws import check_team, draw_faults, draw_victims, most_crashed
+from crash_coach_pkg.coach.draws import (
+    check_team,
+    draw_faults,
+    draw_victims,
+    left_to_chance,
+    most_crashed,
+)
 from crash_coach_pkg.coach.expectations import Expectation
 from crash_coach_pkg.faults import unmet_needs
 from crash_coach_pkg.faults.base import Need
@@ -186,6 +192,11 @@ class ScenarioPlanner:
         self._team = team
         self._seed = seed
         self._cap = scenario.most_crashed(team.n)
+
+    @property
+    def draws(self) -> bool:
+        """Whether any entry leaves something to chance."""
+        return any(left_to_chance(fault, self._team) for fault in self._scenario.faults)
 
     def plan(self, episode: int) -> CrashPlan:
         """The faults of all entries: the same for the same (file, team, seed, episode)."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Any
 
 from crash_coach_pkg.coach.coach import Planner
 from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
@@ -36,11 +36,12 @@ class Planned:
     """Crashes that something else than a coach plans, such as a fault scenario.
 
     ``planner``: for a team and the evaluation's seed; raises UserError where it cannot.
+    ``drawn``: as of a Condition.
     """
 
     name: str
     planner: Callable[[TeamSpec, int], Planner]
-    drawn: ClassVar[bool] = True  # it may
+    drawn: bool = True
 
 
 def crash_free() -> Condition:

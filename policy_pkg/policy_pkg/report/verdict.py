@@ -15,7 +15,10 @@ from policy_pkg.statistics import Estimate, wilson
 
 @dataclass(frozen=True)
 class Verdict:
-    """One expectation, judged. ``interval``: Wilson's 95 %, where a rate was measured."""
+    """One expectation, judged.
+
+    ``interval``: Wilson's 95 %, where a rate was measured and more than one episode says so.
+    """
 
     name: str  # the expectation's key in the file
     wanted: str
@@ -73,7 +76,8 @@ def judge_run(
     trials = Trials(
         len(scenario.faults), _pairs(planner, faulted, crash_free, frozenset(dead_actions))
     )
-    verdicts = tuple(_verdict(expectation, trials) for expectation in scenario.expect)
+    alike = faulted.alike and crash_free.alike
+    verdicts = tuple(_verdict(expectation, trials, alike) for expectation in scenario.expect)
     modes = [fault.crash_mode for fault in scenario.faults]
     entries = tuple(_entry(i, mode, trials, faulted.effects) for i, mode in enumerate(modes))
     return FaultRun(faulted, crash_free, trials, verdicts, entries)
@@ -136,9 +140,9 @@ def _outcome(result: EpisodeResult) -> Outcome:
     return Outcome(result.success, result.episode_return, result.steps)
 
 
-def _verdict(expectation: Expectation, trials: Trials) -> Verdict:
+def _verdict(expectation: Expectation, trials: Trials, alike: bool) -> Verdict:
     finding = expectation.kind.judge(trials)
-    interval = None if finding.counts is None else wilson(*finding.counts)
+    interval = None if alike or finding.counts is None else wilson(*finding.counts)
     return Verdict(expectation.name, expectation.kind.wanted(), finding, interval)
 
 

@@ -73,6 +73,8 @@ class SimNode(Node):
         self._every(_HOUSEKEEPING_S, self._housekeeping)
         if self._lockstep:
             self._every(params.resend_after_s / 2, self._resend)
+            if params.pace_hz:
+                self._every(1 / params.pace_hz, self._advance_if_complete)
         else:
             self._every(period_s, self._tick)
 
@@ -154,7 +156,7 @@ class SimNode(Node):
             self._fail(str(error))
             return
         if counts:
-            self._advance_if_complete()
+            self._decided()
 
     def _on_event(self, event: FaultEvent) -> None:
         robot = self._robot_indexes.get(event.robot)
@@ -163,6 +165,11 @@ class SimNode(Node):
         if not self._lockstep:
             self._newest.mute(robot, event.episode, self._pause.now_s())
         elif self._decisions.mute(robot, event.episode, event.step):
+            self._decided()
+
+    def _decided(self) -> None:
+        """Lock-step: one robot more is; with ``pace_hz`` a timer looks whether all are."""
+        if not self._params.pace_hz:
             self._advance_if_complete()
 
     def _advance_if_complete(self) -> None:

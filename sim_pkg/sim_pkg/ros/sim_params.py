@@ -30,6 +30,9 @@ class SimParameters(StrictModel):
     max_resends: int = Field(
         20, ge=0, le=100_000, description="lockstep: then the episode ends as an error"
     )
+    pace_hz: float = Field(
+        0.0, ge=0, le=1000, description="lockstep: most control steps per second; 0: no limit"
+    )
     match_timeout_s: float = Field(
         30.0, gt=0, le=3600, description="longest wait for every robot's publisher and subscriber"
     )

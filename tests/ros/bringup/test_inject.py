@@ -19,6 +19,7 @@ from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 
 WAIT_S = 30.0
+PACE_HZ = 100.0
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,8 @@ def untouched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Graph]:
     folder = tmp_path_factory.mktemp("graph")
     checkpoint = folder / "step_0"
     write_untrained(checkpoint, make_env("buttons", 1).spec, seed=1)
-    options = UpOptions("buttons", checkpoint, layout="team")
+    # A pace leaves the processor to what is tested, and to other tests.
+    options = UpOptions("buttons", checkpoint, layout="team", sim={"pace_hz": PACE_HZ})
     processes = graph_processes(options, check_team(options))
     with (
         reserve_domain() as domain,

@@ -78,6 +78,18 @@ def test_lock_step_runs_its_episodes_and_hashes_like_the_core(ros_env: Env, driv
     assert list(first.available_actions) == [1] * 5
 
 
+def test_lock_step_at_a_pace_is_the_same_and_no_faster(ros_env: Env, driver: Driver) -> None:
+    driver.rule = scripted
+    with sim(ros_env, seed=11, episodes=1, pace_hz=40.0) as process:
+        driver.until(lambda: driver.states)
+        start = time.monotonic()
+        (end,) = driver.until(driver.ends)
+        took_s = time.monotonic() - start
+        assert end_of(process)[0] == 0
+    assert end.trajectory_hash == core_hash(0, 11)[0]
+    assert took_s > (end.step - 2) / 40.0  # the first state may have been under way for long
+
+
 def test_a_lost_observation_is_sent_again_and_a_duplicate_changes_nothing(
     ros_env: Env, driver: Driver
 ) -> None:

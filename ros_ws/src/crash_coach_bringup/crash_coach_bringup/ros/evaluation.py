@@ -12,6 +12,7 @@ from crash_coach_bringup.ros.client import graph_client
 from crash_coach_bringup.ros.collector import Collector, EvaluationError
 from crash_coach_bringup.ros.domain import reserve_domain
 from crash_coach_bringup.ros.graph import (
+    PATIENT_LEASE_S,
     Layout,
     UpOptions,
     check_team,
@@ -64,10 +65,11 @@ def evaluate_via_ros(
             coach=condition.crash if isinstance(condition, Condition) else CoachConfig(),
             fault_scenario=condition if isinstance(condition, Path) else None,
             domain=domain,
+            lease_s=PATIENT_LEASE_S,
             log_dir=logs,
         )
         team = check_team(options)
-        name, planner = _planner(condition, team, seed, _offers(checkpoint))
+        name, planner, drawn = _planner(condition, team, seed, _offers(checkpoint))
         processes = graph_processes(options, team)
         with Supervisor(processes, logs, graph_environment(domain), throughput=True) as graph:
 
@@ -79,7 +81,6 @@ def evaluate_via_ros(
                 collector = Collector(client, planner, team.robots)
                 results = tuple(collector.play(episode) for episode in range(episodes))
                 effects = collector.effects()
-    drawn = not isinstance(condition, Condition) or condition.drawn
     return Evaluation(name, team.robots, seed, results, effects, drawn)
 
 
@@ -89,18 +90,19 @@ def _offers(checkpoint: Path) -> frozenset[Need]:
 
 def _planner(
     condition: Condition | Path, team: TeamSpec, seed: int, offers: frozenset[Need]
-) -> tuple[str, Planner]:
-    """The condition's name, and what the coach node is going to plan."""
+) -> tuple[str, Planner, bool]:
+    """The condition's name, what the coach node is going to plan, and whether it may be drawn."""
     if isinstance(condition, Path):
         faults = load_fault_scenario(condition)
-        return condition.stem, ScenarioPlanner(faults, team, seed)
+        planner = ScenarioPlanner(faults, team, seed)
+        return condition.stem, planner, planner.draws
     try:
         coach = Coach(condition.crash, team, seed)
     except ValueError as error:
         raise UserError(f"condition {condition.name!r}: {error}") from error
     if reason := unmet_needs(condition.crash.crash_mode, offers):
         raise UserError(f"condition {condition.name!r}: {reason}")
-    return condition.name, coach
+    return condition.name, coach, condition.drawn
 
 
 @contextmanager

@@ -26,6 +26,9 @@ Mode = Literal["lockstep", "realtime"]
 Layout = Literal["nodes", "team", "single"]
 Value = bool | int | float | str | Sequence[str] | Sequence[float] | Sequence[int]
 
+# Where all that counts is what a lock-step graph plays, no fault has to end because a loaded
+# machine lets the coach stand still, and everybody with it. The longest lease that a coach takes.
+PATIENT_LEASE_S = 60.0
 LOST_STEPS = 3  # without a command, as the sim's own default
 
 
@@ -50,7 +53,8 @@ class UpOptions:
     coach and gate out: the policies command the robots directly. ``checkpoint`` None: a trainer
     gives the policies their weights, and the coach its success rates. ``epsilon``: with this
     probability, per robot and step, a policy takes a random action, keyed by ``seed``.
-    ``namespace``: every name of the graph is in it; empty: none.
+    ``namespace``: every name of the graph is in it; empty: none. ``lease_s`` None: the coach's
+    default.
     """
 
     scenario: str
@@ -68,6 +72,7 @@ class UpOptions:
     sim: Mapping[str, Value] = field(default_factory=dict)
     domain: int | None = None  # None: ROS_DOMAIN_ID, or 0
     namespace: str = ""
+    lease_s: float | None = None
     log_dir: Path = Path("runs/up")
 
 
@@ -135,6 +140,8 @@ def coach_parameters(options: UpOptions, team: TeamSpec) -> dict[str, Value]:
         parameters["roles"] = list(team.roles)
     if team.dt_s is not None:
         parameters["dt_s"] = team.dt_s
+    if options.lease_s is not None:
+        parameters["lease_s"] = options.lease_s
     if options.fault_scenario is not None:
         return {**parameters, "fault_scenario": str(options.fault_scenario.resolve())}
     chosen = config.model_dump(exclude_defaults=True, exclude_none=True)

@@ -11,6 +11,7 @@ from typing import Any
 from crash_coach_bringup.ros.discovery import VARIABLE
 from crash_coach_bringup.ros.domain import reserve_domain
 from crash_coach_bringup.ros.graph import (
+    PATIENT_LEASE_S,
     Layout,
     Mode,
     Node,
@@ -116,6 +117,7 @@ def graph_options(
         coach=config.coach,
         sim=sim,
         domain=domain,
+        lease_s=PATIENT_LEASE_S if options.mode == "lockstep" else None,
     )
 
 

@@ -42,24 +42,28 @@ def _axes(width: float, height: float) -> tuple[Figure, Any]:
 
 
 def success(run: FaultRun) -> Figure:
-    """Success rates with Wilson's 95 % intervals, also by how many robots were faulted."""
+    """Success rates with Wilson's 95 % intervals, also by how many robots were faulted; without
+    where the same episode was played again and again."""
     pairs = run.trials.pairs
+    sure = run.crash_free.alike
     groups = [
-        ("crash-free", FREE, [p.crash_free.success for p in pairs]),
-        ("with the faults", FAULTED, [p.faulted.success for p in pairs]),
+        ("crash-free", FREE, [p.crash_free.success for p in pairs], sure),
+        ("with the faults", FAULTED, [p.faulted.success for p in pairs], run.faulted.alike),
     ]
     counts = sorted({p.crashed for p in pairs})
     if len(counts) > 1:
         for k in counts:
             these = [p.faulted.success for p in pairs if p.crashed == k]
-            groups.append((f"{k} faulted", FAULTED, these))
+            groups.append((f"{k} faulted", FAULTED, these, sure and k == 0))
     figure, ax = _axes(2 + 1.2 * len(groups), 3.6)
-    for place, (_, colour, outcomes) in enumerate(groups):
+    for place, (_, colour, outcomes, alike) in enumerate(groups):
         rate = wilson(sum(outcomes), len(outcomes))
         error = [[rate.value - rate.low], [rate.high - rate.value]]
         ax.bar(place, rate.value, 0.6, color=colour, alpha=0.75)
-        ax.errorbar(place, rate.value, error, color=INK, capsize=4)
-    ax.set_xticks(range(len(groups)), [f"{name}\n(n = {len(o)})" for name, _, o in groups])
+        if not alike:
+            ax.errorbar(place, rate.value, error, color=INK, capsize=4)
+    names = [f"{name}\n({'1 episode' if a else f'n = {len(o)}'})" for name, _, o, a in groups]
+    ax.set_xticks(range(len(groups)), names)
     ax.set_ylim(0, 1.05)
     ax.set_ylabel("success rate, 95 % interval", color=INK)
     return figure

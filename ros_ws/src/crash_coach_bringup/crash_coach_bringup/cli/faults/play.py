@@ -56,7 +56,9 @@ def play(
     if via is Via.ros:
         faulted, free = _play_via_ros(faults, target, episodes, seed, layout)
     else:
-        planned = Planned(faults.path.stem, lambda team, key: ScenarioPlanner(faults, team, key))
+        planned = Planned(
+            faults.path.stem, lambda team, key: ScenarioPlanner(faults, team, key), planner.draws
+        )
         faulted = evaluate(target.team, target.source, planned, episodes, seed, effects=True)
         free = evaluate(target.team, target.source, crash_free(), episodes, seed)
     return judge_run(faults, planner, faulted, free, spec.dead_actions)

@@ -19,6 +19,7 @@ from xml.etree import ElementTree
 
 from crash_coach_bringup.cli.markdown import table
 from crash_coach_bringup.cli.output import CliError, not_written, percent_ci
+from crash_coach_bringup.cli.playing import ALIKE
 from policy_pkg.play.evaluate import Evaluation
 from policy_pkg.report.verdict import FaultRun, Verdict
 
@@ -51,14 +52,17 @@ class Played:
 
 
 def measured(verdict: Verdict) -> str:
-    """'87.5 % (79.0..93.1) of 64', '-0.25', or why there is nothing."""
+    """'87.5 % (79.0..93.1) of 64', '100.0 % (1 episode)', '-0.25', or why there is nothing."""
     finding = verdict.finding
     if finding.measured is None:
         return finding.note
     text = f"{finding.measured:.4g}"
-    if finding.counts is not None and verdict.interval is not None:
-        interval = (verdict.interval.low, verdict.interval.high)
-        text = f"{percent_ci(finding.measured, interval)} of {finding.counts[1]}"
+    if finding.counts is not None:
+        interval = verdict.interval
+        bounds = None if interval is None else (interval.low, interval.high)
+        text = percent_ci(finding.measured, bounds)
+        if interval is not None:
+            text += f" of {finding.counts[1]}"
     return f"{text}; {finding.note}" if finding.note else text
 
 
@@ -219,6 +223,7 @@ def report(played: Played, run: FaultRun) -> str:
                 _figures("with the faults", run.faulted),
             ),
         ),
+        *([ALIKE] if run.faulted.alike or run.crash_free.alike else []),
         "![Success rates](success.png)",
         "![Returns of each pair](returns.png)",
         "## What each entry did",
@@ -258,7 +263,8 @@ def _figures(name: str, evaluation: Evaluation) -> tuple[str, ...]:
     return (
         name,
         percent_ci(figures["success_rate"], figures["success_ci95"]),
-        f"{figures['return_mean']:.3f} ± {figures['return_std']:.3f}",
+        f"{figures['return_mean']:.3f}"
+        + ("" if evaluation.alike else f" ± {figures['return_std']:.3f}"),
         f"{figures['steps_mean']:.1f}",
         f"{100 * figures['crashed_fraction']:.1f} %",
         f"`{figures['trajectory_hash']}`",

@@ -23,6 +23,7 @@ from crash_coach_bringup.cli.output import (
     tell_note,
     write_file,
 )
+from crash_coach_bringup.cli.playing import ALIKE
 from crash_coach_pkg.coach.fault_scenario import (
     FaultScenario,
     fault_scenario_names,
@@ -52,6 +53,8 @@ def show(title: str, run: FaultRun) -> None:
         texts = Text(verdict.wanted), Text(measured(verdict)), Text(status, COLOURS[status])
         rows.add_row(*texts)
     console.print(rows)
+    if run.faulted.alike:
+        console.print(ALIKE, soft_wrap=True)
 
 
 def read(file: str) -> FaultScenario:
