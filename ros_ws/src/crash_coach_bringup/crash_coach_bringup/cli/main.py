@@ -17,6 +17,7 @@ from crash_coach_bringup.cli.report import verb as report
 from crash_coach_bringup.cli.terminal import degrade_characters
 from crash_coach_bringup.cli.verbs import (
     bags,
+    behaviour,
     calibrate,
     check_scenario,
     collect,
@@ -65,6 +66,7 @@ app.command("demo")(demo.demo)
 app.command("plot")(plot.plot)
 app.command("collect")(collect.collect)
 app.command("report")(report.report)
+app.command("behaviour")(behaviour.behaviour)
 app.command("export")(export.export)
 app.command("render")(render.render)
 app.command("calibrate")(calibrate.calibrate)
