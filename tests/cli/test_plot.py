@@ -15,14 +15,16 @@ import pytest
 
 from crash_coach_bringup.cli.curves import (
     BOOTSTRAP,
+    EACH_CRASHED,
     RANGE,
+    TRAINING,
     average,
     bootstrap_mean,
     group_runs,
     load_run,
 )
 from crash_coach_bringup.cli.output import CliError
-from crash_coach_bringup.cli.verbs.plot import draw, legend, note, plot, targets
+from crash_coach_bringup.cli.verbs.plot import TITLES, draw, legend, note, plot, targets
 from crash_coach_common.contract import UserError
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.offline.config import OfflineConfig
@@ -74,6 +76,27 @@ def write_offline_run(folder: Path, data: str, test_crashed: tuple[int, ...] = (
     ]
     (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     return folder
+
+
+def test_what_one_crashed_robot_costs_is_drawn_where_it_was_measured(tmp_path: Path) -> None:
+    measured = write_run(tmp_path / "measured-s0")
+    lines = [json.loads(line) for line in (measured / "metrics.jsonl").read_text().splitlines()]
+    for line, rates in zip(lines, ((0.0, 0.0), (1.0, 0.0), (1.0, 0.5)), strict=True):
+        line |= dict(
+            zip(("success_robot_1_crashed", "success_robot_2_crashed"), rates, strict=True)
+        )
+    (measured / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    other = write_run(tmp_path / "other-s0", algorithm="vdn")
+    groups = group_runs([load_run(measured), load_run(other)])
+    curves = [{key: average(group, key) for key in TRAINING.curves} for group in groups]
+    with_it, without = curves
+    assert with_it[EACH_CRASHED] is not None
+    assert with_it[EACH_CRASHED].mean.tolist() == [0.0, 0.5, 0.75]
+    assert without[EACH_CRASHED] is None
+    titles = [ax.get_title() for ax in draw(groups, curves).axes]
+    assert titles[3] == f"{TITLES[EACH_CRASHED]}\nnot measured: other"
+    assert not any("return" in title for title in titles)
+    assert any("return" in ax.get_title() for ax in draw(groups[1:], curves[1:]).axes)
 
 
 def test_runs_on_recordings_are_drawn_by_gradient_steps(tmp_path: Path) -> None:

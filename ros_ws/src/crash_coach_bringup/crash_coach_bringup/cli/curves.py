@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,8 @@ from policy_pkg.train.run_dir import METRICS, RUN, read_run, seedless_name
 MAX_RANGE_SEEDS = 4
 CONFIDENCE = 0.95
 RESAMPLES = 2000
+EACH_CRASHED = "success_each_crashed"  # mean over the robots, each crashed alone in its episodes
+OF_ROBOT = re.compile(r"success_.+_crashed")  # as the metrics have it, see test_victim_episodes
 RANGE, BOOTSTRAP = "min..max", "95 % bootstrap interval of the mean"
 
 Floats = npt.NDArray[np.float64]
@@ -40,7 +43,8 @@ TRAINING = Kind(
     "training in the simulator",
     "env_steps",
     "total_steps",
-    ("success_rate", "success_crash_free", "return_mean", "alpha"),
+    ("success_rate", "success_crash_free", "return_mean", "alpha", EACH_CRASHED),
+    frozenset({EACH_CRASHED}),
 )
 OFFLINE = Kind(
     "training on recordings",
@@ -170,6 +174,7 @@ def _read_line(line: str, place: str, kind: Kind) -> dict[str, float]:
             f"{place}: damaged line: expected an object with {kind.steps} and other figures"
         )
     row = {}
+    content[EACH_CRASHED] = _each_crashed(content)
     for key in (kind.steps, *kind.curves):
         if key not in content and key not in kind.optional:
             raise CliError(f"{place}: damaged line: {key} is missing")
@@ -181,6 +186,16 @@ def _read_line(line: str, place: str, kind: Kind) -> dict[str, float]:
         else:
             raise CliError(f"{place}: damaged line: {key} is {value!r}, not a finite number")
     return row
+
+
+def _each_crashed(content: Mapping[str, Any]) -> float | None:
+    """None where the run's blocks do not crash each robot alone."""
+    found = [
+        float(value)
+        for key, value in content.items()
+        if OF_ROBOT.fullmatch(key) and key != "success_1_crashed" and isinstance(value, int | float)
+    ]
+    return sum(found) / len(found) if found else None
 
 
 def group_runs(runs: Sequence[Run]) -> list[Group]:

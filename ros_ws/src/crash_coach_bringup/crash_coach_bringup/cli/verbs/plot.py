@@ -10,8 +10,10 @@ import numpy as np
 import typer
 
 from crash_coach_bringup.cli.curves import (
+    EACH_CRASHED,
     Curve,
     Group,
+    Kind,
     average,
     group_runs,
     load_run,
@@ -41,11 +43,12 @@ TITLES = {
     "success_crash_free": "success rate without crashes",
     "return_mean": "mean return at the run's crash rate α",
     "alpha": "nominal crash rate α per robot",
+    EACH_CRASHED: "success rate with one robot crashed, mean over robots",
     "success_1_crashed": "success rate with one robot crashed",
     "return_crash_free": "mean return without crashes",
     "loss": "loss: what a gradient step lowers",
 }
-PROBABILITIES = {"success_rate", "success_crash_free", "success_1_crashed"}
+PROBABILITIES = {"success_rate", "success_crash_free", "success_1_crashed", EACH_CRASHED}
 WIDE_LABEL = 50  # characters from which two columns of the legend would not fit
 
 Curves = dict[str, Curve | None]
@@ -61,7 +64,7 @@ def draw(groups: Sequence[Group], curves: Sequence[Curves]) -> Figure:
     figure = Figure(figsize=(10, 6.6 + 0.2 * rows), dpi=160, layout="constrained")
     axes = figure.subplots(2, 2, sharex=True)
     kind = groups[0].runs[0].kind
-    for ax, key in zip(axes.flat, kind.curves, strict=True):
+    for ax, key in zip(axes.flat, shown(kind, curves), strict=True):
         draw_panel(ax, key, groups, [each[key] for each in curves])
     for ax in axes[-1]:
         ax.set_xlabel(STEPS[kind.steps], color=INK)
@@ -76,6 +79,12 @@ def draw(groups: Sequence[Group], curves: Sequence[Curves]) -> Figure:
         figure.supxlabel("\n".join(["○ curve ends early", *notes]), fontsize=8, color=INK)
     figure.legend(handles=handles, loc="outside upper center", ncols=columns, frameon=False)
     return figure
+
+
+def shown(kind: Kind, curves: Sequence[Curves]) -> list[str]:
+    """The four figures to draw: what a crash costs, where a run measured it, before the return."""
+    left_out = "return_mean" if any(each.get(EACH_CRASHED) for each in curves) else EACH_CRASHED
+    return [key for key in kind.curves if key != left_out]
 
 
 def draw_panel(ax: Any, key: str, groups: Sequence[Group], curves: Sequence[Curve | None]) -> None:
