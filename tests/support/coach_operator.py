@@ -59,6 +59,16 @@ class Operator:
         assert answer.successful or answer.reason, "refused without a reason"
         return "" if answer.successful else str(answer.reason)
 
+    def begin(self, **values: object) -> Any:
+        """As ``set``, without waiting: the call's future, for ``poll``."""
+        parameters = [Parameter(name, value=value) for name, value in values.items()]
+        return self.parameters.set_parameters_atomically(parameters)
+
+    def poll(self, future: Any) -> bool:
+        """Serves the node a little; whether there is an answer."""
+        self.executor.spin_once(timeout_sec=0)
+        return bool(future.done())
+
     def get(self, *names: str) -> Sequence[object]:
         values = self._result(self.parameters.get_parameters(list(names))).values
         return [parameter_value_to_python(value) for value in values]

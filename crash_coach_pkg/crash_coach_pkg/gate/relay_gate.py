@@ -1,9 +1,9 @@
 """Faults on commands of any type, without ROS: the core of a gate for robots of your own.
 
-Steps are ticks of ``dt_s`` on a steady clock, common to all robots, in one endless episode 0.
+Steps are those of a clock that is passed in, common to all robots, in one endless episode 0.
 While no fault is in force every command passes at once and untouched. Under a fault a robot has
-at most one command per tick: the first one is decided as it comes, later ones of the same tick
-make way for each other, and the newest is decided as the next tick begins.
+at most one command per step: the first one is decided as it comes, later ones of the same step
+make way for each other, and the newest is decided as the next step begins.
 """
 
 from __future__ import annotations
@@ -64,17 +64,17 @@ class Relay:
     """Decides about a team's commands.
 
     Args:
-        now_s: of a steady clock, when step 0 begins; so are all other times.
+        step_at: the step at a time; it never falls. Times are a steady clock's, in seconds, as
+            those that leases are told by.
 
     Until ``know`` is called no plan with faults is accepted.
     """
 
-    def __init__(self, n_robots: int, dt_s: float, now_s: float) -> None:
+    def __init__(self, n_robots: int, step_at: Callable[[float], int]) -> None:
         self._n = n_robots
-        self._dt_s = dt_s
+        self._step_at = step_at
         self._offers: frozenset[Need] | None = None
         self._tools: Callable[[bytes], Tools[bytes]] | None = None
-        self._start_s = now_s
         self.book = PlanBook(False, 0.0, lambda plan: refusal(plan, self._offers))
         """The plans; read only."""
         self.book.enter(EPISODE)
@@ -86,7 +86,7 @@ class Relay:
         self._team: TeamFaults[bytes] | None = None  # None: the term has no faults
         self._running: list[Change] = []
         self._decided_in = [-1] * n_robots  # under a fault
-        self._waiting: list[bytes | None] = [None] * n_robots  # for the next tick
+        self._waiting: list[bytes | None] = [None] * n_robots  # for the next step
 
     def know(self, offers: frozenset[Need], tools: Callable[[bytes], Tools[bytes]]) -> None:
         """The type of the commands: what its tools can do, and the tools for the step in which
@@ -128,7 +128,7 @@ class Relay:
 
     def _advance(self, now_s: float) -> Outputs:
         """Goes on to the step of ``now_s``."""
-        step = int((now_s - self._start_s) / self._dt_s)
+        step = self._step_at(now_s)
         if step <= self._step:
             return []
         outputs = self._idle()

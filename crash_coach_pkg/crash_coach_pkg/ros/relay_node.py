@@ -16,6 +16,7 @@ from crash_coach_common.contract import UserError
 from crash_coach_pkg.gate.health import Decided
 from crash_coach_pkg.gate.plan_book import PlanBook
 from crash_coach_pkg.gate.relay_gate import Outputs, Relay, Sent
+from crash_coach_pkg.gate.step_clock import StepClock
 from crash_coach_pkg.plan import CrashPlan
 from crash_coach_pkg.ros.command_types import CommandType, Limits, command_type
 from crash_coach_pkg.ros.endpoints import Offer, offered, types_published
@@ -34,6 +35,7 @@ _DURABILITY = {
 # Of publishers with default settings: what is asked for until one is seen.
 _USUAL = Offer(ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE)
 _LOOK_S = 1.0
+NS_PER_S = 1_000_000_000
 
 
 class RelayGate:
@@ -56,16 +58,22 @@ class RelayGate:
             "dt_s",
             0.1,
             (0.001, 60.0),
-            "Length of a step of the faults, seconds: the period of the robots' commands. Under a "
-            "fault a robot gets at most one command per step. The coach's dt_s must be the same.",
+            "Length of a step of the faults, seconds (of /clock, with use_sim_time): the period of "
+            "the robots' commands. Under a fault a robot gets at most one command per step. The "
+            "coach's dt_s must be the same.",
         )
         self._reliability = _choice(base, "reliability", tuple(_RELIABILITY))
         self._durability = _choice(base, "durability", tuple(_DURABILITY))
         self._depth = _depth(base)
         n = len(base.robots)
         now_s = time.monotonic()
-        self._relay = Relay(n, dt_s, now_s)
+        self._steps = StepClock(dt_s)
+        self._sim_ns = 0  # as last read of /clock; 0: nothing came yet
+        self._relay = Relay(n, self._step_at)
         base.create_timer(dt_s, self._on_step, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        if base.get_parameter("use_sim_time").value:
+            # Of a simulator that runs faster than the wall's clock, the timer above misses steps.
+            base.create_timer(dt_s, self._on_step)
         self._commands = [0] * n
         self._relayed = [0] * n
         # Reliable satisfies robots of either kind.
@@ -110,6 +118,8 @@ class RelayGate:
     def warning(self, robot: int) -> str:
         if self._ambiguous:
             return f"command_type auto: several types are published: {_listed(self._ambiguous)}"
+        if self._base.get_clock().ros_time_is_active and not self._sim_ns:
+            return "use_sim_time is set, but nothing came on /clock: steps stand still"
         if self._inputs and self._inputs[robot].get_publisher_count() > 0:
             return ""
         return f"nobody publishes on {self._base.resolve_topic_name(self._base.topics.raw[robot])}"
@@ -127,6 +137,16 @@ class RelayGate:
 
     def _on_step(self) -> None:
         self._send(self._relay.tick(time.monotonic()))
+
+    def _step_at(self, now_s: float) -> int:
+        """By /clock where ``use_sim_time`` is set, otherwise by the steady clock."""
+        clock = self._base.get_clock()
+        if not clock.ros_time_is_active:
+            return self._steps.step("steady", int(now_s * NS_PER_S))
+        before, self._sim_ns = self._sim_ns, clock.now().nanoseconds
+        if before and self._sim_ns != before:
+            self._base.health.sim_moved(now_s)
+        return self._steps.step("sim" if self._sim_ns else "none", self._sim_ns)
 
     def _send(self, outputs: Outputs) -> None:
         for output in outputs:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from crash_coach_pkg.effects import RELAYED, WITHHELD
 from crash_coach_pkg.gate.plan_book import EventKind
 from crash_coach_pkg.gate.relay_gate import Outputs, Relay, Sent
+from crash_coach_pkg.gate.step_clock import StepClock
 from crash_coach_pkg.plan import NEXT_STEP, CrashPlan, Fault, Trigger, TriggerKind
 from crash_coach_pkg.ros.command_types import OpaqueTools
 
@@ -27,7 +28,9 @@ class Stream:
     """A relay, and everything that came out of it."""
 
     def __init__(self) -> None:
-        self.relay = Relay(N, DT_S, START_S)
+        clock = StepClock(DT_S)
+        clock.step("test", int(START_S * 1e9))
+        self.relay = Relay(N, lambda now_s: clock.step("test", int(now_s * 1e9)))
         self.relay.know(OPAQUE, lambda command: OpaqueTools())
         self.outputs: Outputs = []
         self.revision = 0
@@ -252,3 +255,45 @@ def check(history: list[tuple[Act, float]], by_lease: bool) -> None:
     for robot in range(N):
         new = b"%d" % next(_numbers)
         assert stream.command(robot, step, new) == [new]
+
+
+def test_where_the_clock_stands_so_does_the_step() -> None:
+    step = 0
+    relay = Relay(N, lambda now_s: step)
+    relay.know(OPAQUE, lambda command: OpaqueTools())
+    passing = Fault(0, "drop", parameters=(("probability", 0.0),))
+    relay.plan(CrashPlan(0, 1, 7, 0.0, N, (passing,)), LEASE_S, 0.0)
+    outputs = [relay.command(0, b"%d" % number, 0.1 * number) for number in range(5)]
+    assert [len(sent(it, 0)) for it in outputs] == [1, 0, 0, 0, 0]
+    step = 1
+    assert sent(relay.tick(0.6), 0) == [b"4"]  # the newest
+    assert relay.decided()[0].step == 1
+    relay.tick(LEASE_S + 1.0)  # the lease runs on all the same
+    assert relay.command(0, b"after", LEASE_S + 1.1) == [Sent(0, b"after")]
+
+
+class TestStepClock:
+    def test_steps_are_exact(self) -> None:
+        clock = StepClock(0.1)
+        readings = range(5_000_000_000, 8_000_000_000, 10_000_000)
+        assert [clock.step("sim", at) for at in readings] == [i // 10 for i in range(300)]
+
+    def test_it_stands_and_goes_on(self) -> None:
+        clock = StepClock(0.1)
+        clock.step("sim", 0)
+        assert [clock.step("sim", at) for at in (250_000_000,) * 3 + (300_000_000,)] == [2, 2, 2, 3]
+
+    def test_a_jump_back_costs_no_step(self) -> None:
+        clock = StepClock(0.1)
+        clock.step("sim", 10**9)
+        assert clock.step("sim", 2 * 10**9) == 10
+        assert clock.step("sim", 5) == 10
+        assert clock.step("sim", 5 + 10**9) == 20
+
+    def test_another_clock_costs_no_step_and_adds_none(self) -> None:
+        clock = StepClock(0.1)
+        clock.step("none", 0)
+        assert clock.step("sim", 10**18) == 0
+        assert clock.step("sim", 10**18 + 10**9) == 10
+        assert clock.step("steady", 7) == 10
+        assert clock.step("steady", 7 + 10**8) == 11

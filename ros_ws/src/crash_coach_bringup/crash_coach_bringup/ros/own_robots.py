@@ -25,7 +25,8 @@ class OwnRobots:
 
     ``command_type``: package/msg/Type, or auto; ``raw_topic``: what its controllers publish on, and
     ``command_topic``: what its robots listen to, within each robot's namespace; ``dt_s``: length of
-    a step of the faults, seconds; ``namespace``: of every name; empty: none.
+    a step of the faults, seconds, of /clock with ``use_sim_time``; ``namespace``: of every name;
+    empty: none.
     """
 
     robots: tuple[str, ...]
@@ -33,13 +34,18 @@ class OwnRobots:
     raw_topic: str = "cmd_vel_raw"
     command_topic: str = "cmd_vel"
     dt_s: float = 0.1
+    use_sim_time: bool = False
     namespace: str = ""
     log_dir: Path = Path("runs/gate")
 
 
 def own_nodes(team: OwnRobots) -> list[Node]:
     """Gate and coach. Raises UserError for robots' names or a namespace that are none."""
-    shared: dict[str, Value] = {"robots": list(check_robots(team.robots)), "dt_s": team.dt_s}
+    shared: dict[str, Value] = {
+        "robots": list(check_robots(team.robots)),
+        "dt_s": team.dt_s,
+        "use_sim_time": team.use_sim_time,
+    }
     gate: dict[str, Value] = {
         **shared,
         "command_type": team.command_type,

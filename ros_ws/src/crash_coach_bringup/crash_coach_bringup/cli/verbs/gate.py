@@ -36,6 +36,9 @@ def gate(
             max=60,
         ),
     ] = 0.1,
+    use_sim_time: Annotated[
+        bool, typer.Option("--use-sim-time", help="Steps are those of /clock, of a simulator.")
+    ] = False,
     namespace: NamespaceOption = "",
     logs: Annotated[Path, typer.Option(help="Folder for the nodes' logs.")] = Path("runs/gate"),
 ) -> None:
@@ -52,6 +55,7 @@ def gate(
         raw_topic=raw,
         command_topic=command,
         dt_s=dt_s,
+        use_sim_time=use_sim_time,
         namespace=namespace,
         log_dir=logs,
     )
