@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import typer
 
-from crash_coach_bringup.cli.main import app, repeat_options
+from crash_coach_bringup.cli.main import repeat_options, typed_app
 
 ROOT = Path(__file__).resolve().parent.parent
 # typer carries its own click, under a private name
@@ -28,7 +28,7 @@ def commands(text: str) -> list[list[str]]:
 
 def parse(words: list[str]) -> None:
     """Raises UsageError for a verb or an option that does not exist."""
-    command: Any = typer.main.get_command(app)
+    command: Any = typer.main.get_command(typed_app(words))
     context = command.context_class(command)
     words = repeat_options(words)
     while hasattr(command, "resolve_command"):

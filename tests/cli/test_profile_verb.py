@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from crash_coach_bringup.cli.main import app, repeat_options
+from crash_coach_bringup.cli.main import make_app, repeat_options
 from crash_coach_bringup.cli.output import CliError
 from crash_coach_bringup.cli.verbs.profile import HINTS, TITLES, hints, summary
 from policy_pkg.train.config import TrainConfig
@@ -58,7 +58,7 @@ def test_the_summary_says_what_the_table_does_not() -> None:
 
 
 def command(*arguments: str) -> Result:
-    return CliRunner().invoke(app, repeat_options(["profile", *arguments]))
+    return CliRunner().invoke(make_app("profile"), repeat_options(["profile", *arguments]))
 
 
 def test_the_verb_writes_what_it_prints(tmp_path: Path) -> None:

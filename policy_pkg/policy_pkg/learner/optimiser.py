@@ -11,6 +11,7 @@ import torch
 
 from policy_pkg.learner.config import LearnerConfig
 from policy_pkg.learner.flat_parameters import FlatParameters, part
+from policy_pkg.learner.torch_steps import Adam, RMSprop, Steps
 
 Array = npt.NDArray[Any]
 _PREFIX = "optimiser."
@@ -39,7 +40,7 @@ class Optimiser:
 
     def state_dict(self) -> dict[str, Array]:
         """Copies, by name; nothing before the first step."""
-        state = self._optimiser.state[self._flat]
+        state = self._optimiser.state
         return {_PREFIX + name: tensor.numpy().copy() for name, tensor in state.items()}
 
     def load_state_dict(self, arrays: dict[str, Array], updates: int) -> None:
@@ -55,7 +56,7 @@ class Optimiser:
                 f"learner state's optimiser arrays {sorted(moments)} do not fit "
                 f"{self._config.optimiser} over {size} parameters"
             )
-        self._optimiser.state[self._flat] = {
+        self._optimiser.state = {
             name: torch.from_numpy(array.copy()) for name, array in moments.items()
         }
 
@@ -75,7 +76,5 @@ def _moments(config: LearnerConfig, parameters: int) -> dict[str, tuple[int, ...
     return {"step": (), **dict.fromkeys(names, (parameters,))}
 
 
-def _make(config: LearnerConfig, flat: torch.Tensor) -> torch.optim.Optimizer:
-    if config.optimiser == "adam":
-        return torch.optim.Adam([flat], lr=config.lr, eps=config.optim_eps)
-    return torch.optim.RMSprop([flat], lr=config.lr, alpha=config.optim_alpha, eps=config.optim_eps)
+def _make(config: LearnerConfig, flat: torch.Tensor) -> Steps:
+    return (Adam if config.optimiser == "adam" else RMSprop)(config, flat)

@@ -24,6 +24,7 @@ from pathlib import Path
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.run import train
 train(TrainConfig.model_validate_json(sys.argv[2]), Path(sys.argv[1]))
+assert "torch._dynamo" not in sys.modules, "torch's compiler is slower to load than all the rest"
 """
 ROWS = """
 import numpy as np

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from crash_coach_bringup.cli.main import app, repeat_options
+from crash_coach_bringup.cli.main import repeat_options, typed_app
 from crash_coach_bringup.cli.output import CliError
 from crash_coach_common.contract import UserError
 from policy_pkg.checkpoint import load_policy
@@ -47,7 +47,8 @@ def table(
 
     def evaluated(*options: str) -> Table:
         fixed = ["evaluate", str(checkpoint), "--episodes", str(EPISODES), "--json", str(out)]
-        app(repeat_options([*fixed, *options]), standalone_mode=False)
+        arguments = [*fixed, *options]
+        typed_app(arguments)(repeat_options(arguments), standalone_mode=False)
         title, edge, rows = capfd.readouterr().out.partition("┏")
         assert "episodes each" in " ".join(title.split())
         return (edge + rows).splitlines(), json.loads(out.read_text())["conditions"]
@@ -96,7 +97,7 @@ def test_errors_come_from_a_process_as_they_are(checkpoint: Path) -> None:
         evaluate_on(2, load_policy(checkpoint), SCENARIO, [exactly(9)], 4, 0)
     arguments = ["evaluate", str(checkpoint), "--via", "ros", "--processes", "2"]
     with pytest.raises(CliError, match=r"--processes 2: .*one graph"):
-        app(arguments, standalone_mode=False)
+        typed_app(arguments)(arguments, standalone_mode=False)
 
 
 def test_a_process_that_dies_ends_the_evaluation(checkpoint: Path) -> None:

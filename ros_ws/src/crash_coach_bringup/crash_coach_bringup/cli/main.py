@@ -2,80 +2,78 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
 import sys
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import typer
 
 from crash_coach_bringup.cli import signals
-from crash_coach_bringup.cli.faults import verb as faults
 from crash_coach_bringup.cli.multi_value import expand
 from crash_coach_bringup.cli.output import surroundings
-from crash_coach_bringup.cli.report import verb as report
 from crash_coach_bringup.cli.terminal import degrade_characters
-from crash_coach_bringup.cli.verbs import (
-    bags,
-    behaviour,
-    calibrate,
-    check_scenario,
-    collect,
-    demo,
-    doctor,
-    evaluate,
-    export,
-    gate,
-    inject,
-    plot,
-    profile,
-    record,
-    render,
-    sweep,
-    train,
-    train_live,
-    train_offline,
-    up,
-)
 from crash_coach_common.contract import UserError
-from crash_coach_console.command import console
 
-app = typer.Typer(
-    name="crash-coach",
-    help="Crash robots of a team on purpose: see what it costs, train it away.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-)
-app.command("doctor")(doctor.doctor)
-app.command("train")(train.train)
-app.command("train-live")(train_live.train_live)
-app.command("train-offline")(train_offline.train_offline)
-app.command("sweep")(sweep.sweep)
-app.command("evaluate")(evaluate.evaluate)
-app.command("profile")(profile.profile)
-app.add_typer(faults.app, name="faults")
-app.command("up")(up.up)
-app.command("inject")(inject.inject)
-app.command("gate")(gate.gate)
-app.command("console")(console)
-app.command("record")(record.record)
-app.add_typer(bags.app, name="bags")
-app.command("demo")(demo.demo)
-app.command("plot")(plot.plot)
-app.command("collect")(collect.collect)
-app.command("report")(report.report)
-app.command("behaviour")(behaviour.behaviour)
-app.command("export")(export.export)
-app.command("render")(render.render)
-app.command("calibrate")(calibrate.calibrate)
-app.command("check-scenario")(check_scenario.check_scenario)
+# In the order of --help. A verb's module is loaded where the verb is typed, or nothing known is:
+# no verb should wait for what only others need.
+VERBS = {
+    "doctor": "crash_coach_bringup.cli.verbs.doctor:doctor",
+    "train": "crash_coach_bringup.cli.verbs.train:train",
+    "train-live": "crash_coach_bringup.cli.verbs.train_live:train_live",
+    "train-offline": "crash_coach_bringup.cli.verbs.train_offline:train_offline",
+    "sweep": "crash_coach_bringup.cli.verbs.sweep:sweep",
+    "evaluate": "crash_coach_bringup.cli.verbs.evaluate:evaluate",
+    "profile": "crash_coach_bringup.cli.verbs.profile:profile",
+    "faults": "crash_coach_bringup.cli.faults.verb:app",
+    "up": "crash_coach_bringup.cli.verbs.up:up",
+    "inject": "crash_coach_bringup.cli.verbs.inject:inject",
+    "gate": "crash_coach_bringup.cli.verbs.gate:gate",
+    "console": "crash_coach_console.command:console",
+    "record": "crash_coach_bringup.cli.verbs.record:record",
+    "bags": "crash_coach_bringup.cli.verbs.bags:app",
+    "demo": "crash_coach_bringup.cli.verbs.demo:demo",
+    "plot": "crash_coach_bringup.cli.verbs.plot:plot",
+    "collect": "crash_coach_bringup.cli.verbs.collect:collect",
+    "report": "crash_coach_bringup.cli.report.verb:report",
+    "behaviour": "crash_coach_bringup.cli.verbs.behaviour:behaviour",
+    "export": "crash_coach_bringup.cli.verbs.export:export",
+    "render": "crash_coach_bringup.cli.verbs.render:render",
+    "calibrate": "crash_coach_bringup.cli.verbs.calibrate:calibrate",
+    "check-scenario": "crash_coach_bringup.cli.verbs.check_scenario:check_scenario",
+}
 
 
-def repeat_options(arguments: list[str]) -> list[str]:
+def make_app(verb: str | None = None) -> typer.Typer:
+    """The command with this verb alone, or with all."""
+    app = typer.Typer(
+        name="crash-coach",
+        help="Crash robots of a team on purpose: see what it costs, train it away.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        callback=lambda: None,  # with a single verb, too, the verb has to be typed
+    )
+    for name in VERBS if verb is None else (verb,):
+        module, _, attribute = VERBS[name].partition(":")
+        found: Any = getattr(importlib.import_module(module), attribute)
+        if isinstance(found, typer.Typer):
+            app.add_typer(found, name=name)
+        else:
+            app.command(name)(found)
+    return app
+
+
+def typed_app(arguments: list[str]) -> typer.Typer:
+    """The command for a command line: with the verb that it begins with, otherwise with all."""
+    return make_app(arguments[0] if arguments and arguments[0] in VERBS else None)
+
+
+def repeat_options(arguments: list[str], app: typer.Typer | None = None) -> list[str]:
     """The command line as typer reads it. Raises CliError as ``multi_value.expand``."""
-    return expand(arguments, typer.main.get_command(app))
+    return expand(arguments, typer.main.get_command(app or typed_app(arguments)))
 
 
 def main() -> None:
@@ -85,7 +83,8 @@ def main() -> None:
     degrade_characters()
     try:
         with signals.raised():
-            app(args=repeat_options(sys.argv[1:]))
+            app = typed_app(sys.argv[1:])
+            app(args=repeat_options(sys.argv[1:], app))
     except UserError as error:
         _fail(f"error: {error}")
     except OSError as error:
