@@ -18,7 +18,6 @@ from crash_coach_bringup.ros.client import graph_client
 from crash_coach_bringup.ros.graph import (
     GraphError,
     Node,
-    UpOptions,
     check_team,
     graph_nodes,
     node_process,
@@ -30,6 +29,7 @@ from sim_pkg.env import make_env
 
 SOURCES = Path(__file__).parents[3] / "ros_ws/src/crash_coach_bringup"
 SHARE = Path(get_package_share_directory("crash_coach_bringup"))
+LAUNCH_NODES = "crash_coach_bringup.ros.launch_nodes"
 DEFAULTS = {a.name: a.default or "" for a in ARGUMENTS}
 
 
@@ -72,12 +72,12 @@ def test_each_executable_runs_appears_in_the_graph_and_ends_on_sigint(
             )
         for child in children.values():
             child.send_signal(signal.SIGINT)
-    finally:
         for name, child in children.items():
-            try:
-                said[name], _ = child.communicate(timeout=10)
-            finally:
-                child.kill()
+            said[name], _ = child.communicate(timeout=30)
+    finally:  # one that hangs must not leave the others on a domain that the next test gets
+        for child in children.values():
+            child.kill()
+            child.wait(timeout=10)
     assert {
         name: (child.returncode, said[name]) for name, child in children.items()
     } == dict.fromkeys(expected, (0, ""))
@@ -89,51 +89,81 @@ def test_rviz_that_is_not_installed_is_refused_before_anything_starts(checkpoint
         launch_nodes(checkpoint, rviz="true")
 
 
-def test_the_launch_file_uses_nothing_that_does_not_exist() -> None:
-    path = SHARE / "launch" / "team.launch.py"
+@pytest.mark.parametrize("file", ["team", "own_robots"])
+def test_a_launch_file_uses_nothing_that_does_not_exist(file: str) -> None:
+    path = SHARE / "launch" / f"{file}.launch.py"
     tree = ast.parse(path.read_text())
     compile(tree, str(path), "exec")
     defined = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
     assert "generate_launch_description" in defined
-    imports = {
+    for module, name in imports(tree):
+        top = module.partition(".")[0]
+        assert top in ("__future__", "launch", "launch_ros", "crash_coach_bringup")
+        # What a launch file shares with the other needs launch as well.
+        if module == LAUNCH_NODES:
+            shared = ast.parse((SOURCES / f"{module.replace('.', '/')}.py").read_text())
+            assert name in {n.name for n in shared.body if isinstance(n, ast.FunctionDef)}
+        elif top == "crash_coach_bringup":
+            assert hasattr(__import__(module, fromlist=[name]), name)
+
+
+def imports(tree: ast.Module) -> set[tuple[str, str]]:
+    return {
         (node.module, alias.name)
         for node in tree.body
         if isinstance(node, ast.ImportFrom) and node.module is not None
         for alias in node.names
     }
-    ours = {pair for pair in imports if pair[0].startswith("crash_coach_bringup")}
-    assert {name for _, name in ours} == {"ARGUMENTS", "options_from", "check_team", "graph_nodes"}
-    for module, name in ours:
-        assert hasattr(__import__(module, fromlist=[name]), name)
-    assert {m.partition(".")[0] for m, _ in imports - ours} == {
-        "__future__",
-        "launch",
-        "launch_ros",
-    }
 
 
-def test_every_launch_argument_reaches_the_graph(checkpoint: Path) -> None:
-    options = options_from(
-        {
-            "scenario": "buttons",
-            "checkpoint": str(checkpoint),
-            "mode": "lockstep",
-            "layout": "team",
-            "seed": "7",
-            "episodes": "3",
-            "namespace": "fleet_a",
-            "rviz": "false",
-        }
-    )
-    assert options == UpOptions(
-        "buttons", checkpoint, "lockstep", "team", seed=7, episodes=3, namespace="fleet_a"
-    )
-    parameters = {
-        node.name: node.parameters for node in graph_nodes(options, TeamSpec(("robot_1",)))
+def test_every_launch_argument_reaches_the_graph(checkpoint: Path, tmp_path: Path) -> None:
+    file = tmp_path / "file.yaml"
+    file.write_text("/**:\n  ros__parameters: {lease_s: 2.0}\n")
+    given = {
+        "scenario": "buttons",
+        "checkpoint": str(checkpoint),
+        "mode": "lockstep",
+        "layout": "team",
+        "seed": "7",
+        "episodes": "3",
+        "crash_rate": "0.25",
+        "epsilon": "0.5",
+        "relay_observations": "true",
+        "namespace": "fleet_a",
+        "params_file": str(file),
+        "use_sim_time": "true",
+        "log_level": "warn",
+        "fault_scenario": "one_mute",
+        "rviz": "false",
     }
+    assert set(given) == {argument.name for argument in ARGUMENTS}
+    options = options_from(given)
+    nodes = {node.name: node for node in graph_nodes(options, TeamSpec(("robot_1",)))}
+    parameters = {name: node.parameters for name, node in nodes.items()}
     assert parameters["sim"]["seed"] == parameters["coach"]["seed"] == 7
     assert parameters["sim"]["episodes"] == 3
     assert parameters["gate"]["lockstep"] is True
+    assert parameters["gate"]["relay_observations"] is True
+    assert parameters["team"]["epsilon"] == 0.5
+    assert str(parameters["coach"]["fault_scenario"]).endswith("one_mute.yaml")
+    assert {n for n, p in parameters.items() if p.get("use_sim_time")} == {"gate", "coach", "team"}
+    for node in nodes.values():
+        assert (node.namespace, node.log_level, node.params_file) == ("/fleet_a", "warn", file)
+        words = node.arguments()
+        assert words.index("--params-file") > max(i for i, w in enumerate(words) if w == "-p")
+        assert words[words.index("--log-level") + 1] == "warn"
+    rated = options_from({**given, "fault_scenario": ""})
+    coach = {node.name: node for node in graph_nodes(rated, TeamSpec(("robot_1",)))}["coach"]
+    assert coach.parameters["crash_rate"] == 0.25
+
+
+@pytest.mark.parametrize("text", ["-0.1", "1.5", "nan", "much"])
+@pytest.mark.parametrize("name", ["crash_rate", "epsilon"])
+def test_a_launch_argument_that_is_no_probability_is_named(
+    checkpoint: Path, name: str, text: str
+) -> None:
+    with pytest.raises(GraphError, match=f"{name}:={text} is not a number from 0 to 1"):
+        launch_nodes(checkpoint, **{name: text})
 
 
 @pytest.mark.parametrize("name", ["seed", "episodes"])

@@ -12,6 +12,7 @@ from typing import Literal
 from crash_coach_bringup.ros import discovery
 from crash_coach_bringup.ros.domain import check_domain
 from crash_coach_bringup.ros.namespaces import checked_namespace
+from crash_coach_bringup.ros.parameter_file import ParameterFile
 from crash_coach_bringup.ros.probe import find_executable
 from crash_coach_common.contract import UserError
 from crash_coach_pkg.coach.config import CoachConfig, FaultConfig, TeamSpec
@@ -54,7 +55,8 @@ class UpOptions:
     gives the policies their weights, and the coach its success rates. ``epsilon``: with this
     probability, per robot and step, a policy takes a random action, keyed by ``seed``.
     ``namespace``: every name of the graph is in it; empty: none. ``lease_s`` None: the coach's
-    default.
+    default. ``params_file``, ``log_level``: as Node's, of every node; ``use_sim_time``: of every
+    node but the sim, whose clock it is.
     """
 
     scenario: str
@@ -73,23 +75,36 @@ class UpOptions:
     domain: int | None = None  # None: ROS_DOMAIN_ID, or 0
     namespace: str = ""
     lease_s: float | None = None
+    params_file: Path | None = None
+    use_sim_time: bool = False
+    log_level: str = "info"
     log_dir: Path = Path("runs/up")
 
 
 @dataclass(frozen=True)
 class Node:
-    """A ROS node: where it comes from, its name and namespace ('': none) and its parameters."""
+    """A ROS node: where it comes from, its name and namespace ('': none) and its parameters.
+
+    ``params_file``: a ROS parameter file, whose values win.
+    """
 
     name: str
     package: str
     executable: str
     parameters: Mapping[str, Value]
     namespace: str = ""
+    params_file: Path | None = None
+    log_level: str = "info"
 
     def arguments(self) -> list[str]:
         """--ros-args for a process that holds this node only."""
         start = ["-r", f"__node:={self.name}", *namespace_rule(self.namespace)]
-        return ros_arguments(start, "", self.parameters)
+        return ros_arguments(start, "", self.parameters, self.common())
+
+    def common(self) -> list[str]:
+        """What is said once for a process; the file comes last, because later values win."""
+        file = ["--params-file", str(self.params_file)] if self.params_file else []
+        return ["--log-level", self.log_level, *file]
 
 
 @dataclass(frozen=True)
@@ -117,13 +132,15 @@ def namespace_rule(namespace: str) -> list[str]:
     return ["-r", f"__ns:={namespace}"] if namespace else []
 
 
-def ros_arguments(start: list[str], prefix: str, parameters: Mapping[str, Value]) -> list[str]:
-    """--ros-args with ``start`` and one -p per parameter. JSON is YAML that keeps its types."""
+def ros_arguments(
+    start: list[str], prefix: str, parameters: Mapping[str, Value], end: Sequence[str] = ()
+) -> list[str]:
+    """``start``, one -p per parameter, ``end``. JSON is YAML that keeps its types."""
     arguments = ["--ros-args", *start]
     for name, value in parameters.items():
         plain = value if isinstance(value, bool | int | float | str) else list(value)
         arguments += ["-p", f"{prefix}{name}:={json.dumps(plain)}"]
-    return [*arguments, "--"]
+    return [*arguments, *end, "--"]
 
 
 def coach_parameters(options: UpOptions, team: TeamSpec) -> dict[str, Value]:
@@ -201,7 +218,7 @@ def graph_nodes(options: UpOptions, team: TeamSpec) -> list[Node]:
     """The graph's nodes, the sim last: the others are ready to answer when it starts.
 
     Raises:
-        UserError: as relays_observations and checked_namespace.
+        UserError: as relays_observations and placed.
     """
     acting: dict[str, Value] = {"command_topic": "command_raw" if options.gate else "command"}
     if options.checkpoint is None:
@@ -243,9 +260,31 @@ def graph_nodes(options: UpOptions, team: TeamSpec) -> list[Node]:
         "autostart": options.autostart,
         **options.sim,
     }
-    namespace = checked_namespace(options.namespace)
+    if options.use_sim_time:
+        nodes = [replace(n, parameters={**n.parameters, "use_sim_time": True}) for n in nodes]
     nodes.append(Node("sim", "sim_pkg", "sim", sim))
-    return [replace(node, namespace=namespace) for node in nodes]
+    return placed(nodes, options.namespace, options.params_file, options.log_level)
+
+
+def placed(
+    nodes: Sequence[Node], namespace: str, params_file: Path | None, log_level: str
+) -> list[Node]:
+    """The nodes in ``namespace``, with what all of a graph have in common.
+
+    Raises:
+        UserError: no such namespace, a parameter file that is none, or one that changes what the
+            graph is built from.
+    """
+    space = checked_namespace(namespace)
+    if params_file is not None:
+        file = ParameterFile(params_file)
+        for node in nodes:
+            file.check(f"{space}/{node.name}", node.parameters)
+        params_file = file.path
+    return [
+        replace(node, namespace=space, params_file=params_file, log_level=log_level)
+        for node in nodes
+    ]
 
 
 def graph_processes(options: UpOptions, team: TeamSpec) -> list[Process]:
@@ -271,5 +310,6 @@ def single_process(nodes: Sequence[Node]) -> Process:
     for node in nodes:
         start = namespace_rule(node.namespace)
         arguments += ros_arguments(start, f"{node.name}:", node.parameters)
+    arguments += ros_arguments([], "", {}, nodes[0].common())
     module = "crash_coach_bringup.ros.single"
     return Process("graph", (sys.executable, "-m", module, *arguments))
