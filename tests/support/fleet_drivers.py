@@ -36,6 +36,7 @@ class Drivers(threading.Thread):
         self.sent: dict[str, list[tuple[int, float]]] = {name: [] for name in ROVERS}
         self.got: dict[str, list[tuple[int, float]]] = {name: [] for name in ROVERS}
         self.commands: dict[str, list[Twist]] = {name: [] for name in ROVERS}
+        self.wanted_m_s: dict[str, float] = {}  # where it is not SPEED_M_S
         self.odometry: dict[str, Odometry] = {}
         self.events: list[FaultEvent] = []
         self.status: dict[str, DiagnosticStatus] = {}
@@ -75,7 +76,8 @@ class Drivers(threading.Thread):
     def _drive(self) -> None:
         for name, publisher in self._raws.items():
             message = Twist()
-            message.linear.x, message.angular.z = SPEED_M_S, TURN_RAD_S
+            message.linear.x = self.wanted_m_s.get(name, SPEED_M_S)
+            message.angular.z = TURN_RAD_S
             message.linear.z = float(len(self.sent[name]))
             self.sent[name].append((len(self.sent[name]), time.monotonic()))
             publisher.publish(message)

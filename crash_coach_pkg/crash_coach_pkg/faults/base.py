@@ -76,8 +76,8 @@ class Tools(Protocol[C]):
         """Need vector: (6,) linear x, y, z in m/s and angular x, y, z in rad/s."""
         ...
 
-    def with_vector(self, command: C, vector: Vector) -> C:
-        """Need vector: the same command with other velocities."""
+    def with_vector(self, command: C, vector: Vector) -> C | None:
+        """Need vector: the same command with other velocities; None: no robot should get them."""
         ...
 
 

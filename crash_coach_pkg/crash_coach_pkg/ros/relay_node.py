@@ -39,7 +39,7 @@ NS_PER_S = 1_000_000_000
 
 
 class RelayGate:
-    """Relays bytes; a serialized command is looked into only where a fault in force asks for it.
+    """Relays bytes; a serialized command is changed only where a fault in force asks for it.
 
     With ``command_type`` auto it begins once somebody publishes commands, and with their type.
 
@@ -76,6 +76,8 @@ class RelayGate:
             base.create_timer(dt_s, self._on_step)
         self._commands = [0] * n
         self._relayed = [0] * n
+        self._not_finite = [0] * n
+        self._told_not_finite = [0] * n
         # Reliable satisfies robots of either kind.
         offer = Offer(
             _RELIABILITY.get(self._reliability, _USUAL.reliability),
@@ -113,7 +115,11 @@ class RelayGate:
         return self._relay.decided()
 
     def counters(self, robot: int) -> Sequence[tuple[str, int]]:
-        return (("commands", self._commands[robot]), ("relayed", self._relayed[robot]))
+        return (
+            ("commands", self._commands[robot]),
+            ("relayed", self._relayed[robot]),
+            ("not_finite", self._not_finite[robot]),
+        )
 
     def warning(self, robot: int) -> str:
         if self._ambiguous:
@@ -121,8 +127,18 @@ class RelayGate:
         if self._base.get_clock().ros_time_is_active and not self._sim_ns:
             return "use_sim_time is set, but nothing came on /clock: steps stand still"
         if self._inputs and self._inputs[robot].get_publisher_count() > 0:
-            return ""
+            return self._wild(robot)
         return f"nobody publishes on {self._base.resolve_topic_name(self._base.topics.raw[robot])}"
+
+    def _wild(self, robot: int) -> str:
+        """Whether commands that are not finite came since the last report."""
+        count, before = self._not_finite[robot], self._told_not_finite[robot]
+        self._told_not_finite[robot] = count
+        if count == before:
+            return ""
+        text = f"commands with a velocity that is not finite: {count - before}"
+        self._base.get_logger().warning(f"{self._base.robots[robot]}: {text}")
+        return text
 
     def close(self) -> None:
         """Nothing is open that the node does not close."""
@@ -133,6 +149,8 @@ class RelayGate:
         now_s = time.monotonic()
         self._base.health.heard(robot, now_s)
         self._commands[robot] += 1
+        assert self._type is not None  # subscribed in ``_begin``
+        self._not_finite[robot] += not self._type.finite(data)
         self._send(self._relay.command(robot, data, now_s))
 
     def _on_step(self) -> None:
@@ -218,7 +236,7 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def _limits(base: GateBase) -> Limits:
-    about = "Twist types: a random command is uniform within plus and minus this, "
+    about = "Twist types: no fault goes beyond plus and minus this, unless the controller does, "
     return Limits(
         base.number("limit.linear_x_m_s", 0.5, (0.0, 100.0), f"{about}m/s."),
         base.number("limit.linear_y_m_s", 0.0, (0.0, 100.0), f"{about}m/s."),

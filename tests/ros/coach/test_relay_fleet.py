@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import statistics
@@ -13,6 +14,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 from coach_graph import operator, process, run_to_end
 from coach_operator import WAIT_S, Operator
@@ -177,8 +179,10 @@ def test_dropped_commands_are_lost_and_the_others_are_untouched(driving: Fleet) 
 @pytest.mark.parametrize(
     ("mode", "parameters", "expected_m_s"),
     [
-        ("bias", {"linear_x_m_s": 0.3}, SPEED_M_S + 0.3),
+        ("bias", {"linear_x_m_s": 0.1}, SPEED_M_S + 0.1),
+        ("bias", {"linear_x_m_s": 0.3}, LIMIT_M_S),
         ("scale", {"linear": -0.5}, SPEED_M_S * -0.5),
+        ("scale", {"linear": -9.0}, -LIMIT_M_S),
     ],
 )
 def test_velocities_are_changed(
@@ -198,6 +202,31 @@ def test_random_commands_stay_within_the_limits(driving: Fleet) -> None:
     assert all(abs(t.linear.x) <= LIMIT_M_S and abs(t.angular.z) <= LIMIT_RAD_S for t in drawn)
     assert len({t.linear.x for t in drawn}) > 10
     assert all(t.linear.y == 0.0 for t in drawn)
+
+
+def test_commands_that_are_not_finite_pass_counted_and_are_never_changed(driving: Fleet) -> None:
+    d = driving.drivers
+    before = len(d.commands[OTHER])
+    d.wanted_m_s[OTHER] = math.nan
+    d.until(lambda: math.isnan(d.commands[OTHER][-1].linear.x), "a command as it came")
+    d.says(OTHER, "commands with a velocity that is not finite: ")
+    counts = {value.key: value.value for value in d.status[OTHER].values}
+    assert int(counts["not_finite"]) > 0
+    for mode, parameters in (("scale", {"linear": 0.5}), ("bias", {"angular_z_rad_s": 0.1})):
+        driving.fault(mode, victim=OTHER, **parameters)
+        d.drive_on(5)
+        known = len(d.commands[OTHER])
+        d.drive_on(5)
+        assert len(d.commands[OTHER]) == known > before, mode
+        assert d.effects(OTHER)[-1].applied == FaultEvent.WITHHELD
+    driving.fault("random", victim=OTHER)
+    d.drive_on(3)
+    known = len(d.commands[OTHER])
+    d.drive_on(5)
+    drawn = d.commands[OTHER][known:]
+    assert drawn
+    assert all(abs(command.linear.x) <= LIMIT_M_S for command in drawn)
+    d.wanted_m_s.clear()
 
 
 def test_what_twists_cannot_have_is_refused(driving: Fleet) -> None:
@@ -246,6 +275,50 @@ def test_an_unknown_type_ends_the_gate_with_one_line(ros_env: dict[str, str]) ->
     assert code == 1
     assert errors.startswith("gate: error: parameter command_type = 'nowhere_msgs/msg/Twist': ")
     assert errors.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["Twist", "TwistStamped"])
+class TestVelocities:
+    """What faults make of them, of both types."""
+
+    @staticmethod
+    def made(name: str, frame: str = "", **linear: float) -> bytes:
+        message = Twist() if name == "Twist" else TwistStamped()
+        twist = message if name == "Twist" else message.twist
+        if name == "TwistStamped":
+            message.header.frame_id = frame
+        for axis, value in linear.items():
+            setattr(twist.linear, axis, value)
+        return serialize_message(message)
+
+    def test_no_fault_goes_beyond_a_limit_that_the_controller_keeps(self, name: str) -> None:
+        kind = command_type(f"geometry_msgs/msg/{name}", Limits(1.0, 0.5, 2.0))
+        data = self.made(name, x=0.8, y=-0.7, z=3.0)
+        tools = kind.tools(data)
+        changed = tools.with_vector(data, np.array([5.0, -5.0, 90.0, 7.0, 0.0, -5.0]))
+        assert changed is not None
+        # y: the controller itself wants more than the limit; z, and turning over x: none.
+        assert tools.vector(changed).tolist() == [1.0, -0.7, 90.0, 7.0, 0.0, -2.0]
+
+    @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+    def test_what_is_not_finite_is_never_sent(self, name: str, value: float) -> None:
+        kind = command_type(f"geometry_msgs/msg/{name}", Limits(1.0, 0.5, 2.0))
+        fine, wild = self.made(name, x=0.5), self.made(name, x=0.5, z=value)
+        tools = kind.tools(fine)
+        assert tools.with_vector(fine, np.array([0.1, 0, 0, value, 0, 0])) is None
+        assert tools.with_vector(wild, tools.vector(wild) * 0.5) is None
+        drawn = kind.tools(wild).sample(3)
+        assert drawn is not None
+        assert np.isfinite(tools.vector(drawn)).all()
+
+    @pytest.mark.parametrize("frame", ["", "a", "base", "base_link", "robot_1/base_link"])
+    @pytest.mark.parametrize("value", [0.25, math.nan, math.inf])
+    def test_finite_is_read_off_the_bytes(self, name: str, frame: str, value: float) -> None:
+        kind = command_type(f"geometry_msgs/msg/{name}", Limits(1.0, 0.5, 2.0))
+        data = self.made(name, frame, x=1.0, z=value)
+        assert kind.finite(data) == math.isfinite(value)
+        assert not kind.finite(data[:-1])
+        assert not kind.finite(data[:5])
 
 
 def test_twists_with_a_header_keep_it() -> None:

@@ -48,7 +48,7 @@ SimTimeOption = Annotated[
     bool, typer.Option("--use-sim-time", help="Steps are those of /clock, of a simulator.")
 ]
 ScenarioOption = Annotated[
-    Path | None, typer.Option(help="YAML file that decides who crashes, when and how.")
+    str | None, typer.Option(help="By name or path: decides who crashes, when and how.")
 ]
 FileOption = Annotated[
     Path | None, typer.Option(help="ROS parameter file for gate and coach; robots may be in it.")
@@ -75,6 +75,7 @@ def gate(
     if not robots and params_file is None:
         raise CliError("give --robots NAME ..., or a --params-file that names them")
     from crash_coach_bringup.ros.own_robots import OwnRobots, run_own
+    from crash_coach_pkg.coach.fault_scenario import find_fault_scenario
 
     team = OwnRobots(
         robots=tuple(robots or ()),
@@ -83,7 +84,7 @@ def gate(
         command_topic=command,
         dt_s=dt_s,
         use_sim_time=use_sim_time,
-        fault_scenario=fault_scenario,
+        fault_scenario=find_fault_scenario(fault_scenario) if fault_scenario else None,
         namespace=namespace,
         params_file=params_file,
         log_dir=logs,
