@@ -12,6 +12,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from crash_coach_common.contract import UserError
+from crash_coach_common.ros.peers import several
 from crash_coach_common.ros.qos import BLOCKS, EPISODE, EVENTS, PLAN
 from crash_coach_common.ros.run_node import TICK_S
 from crash_coach_pkg.coach.live_coach import Control
@@ -28,6 +29,7 @@ HEARTBEATS_PER_LEASE = 3
 # How long the first plan waits for a gate to be discovered and to say what is in force. A gate
 # always says something, so that only a coach without one waits for so long.
 ADOPT_TIMEOUT_S = 5.0
+PLAN_TOPIC, IN_FORCE_TOPIC = "coach/plan", "coach/plan_in_force"
 ENDLESS = Played(episode=0, ended=False, success=False)
 
 
@@ -72,10 +74,9 @@ class CoachLink(Node):
         self._told = False  # whether the gate has told it
         self._left: CrashPlan | None = None
         self._waiting: list[Played] = [] if follow_sim else [ENDLESS]
-        self._plans = self.create_publisher(CrashPlanMessage, "coach/plan", PLAN)
-        self.create_subscription(
-            CrashPlanMessage, "coach/plan_in_force", self._on_plan_in_force, PLAN
-        )
+        # The coach's own, so that its name is what others see; publishing needs no executor.
+        self._plans = coach.create_publisher(CrashPlanMessage, PLAN_TOPIC, PLAN)
+        self.create_subscription(CrashPlanMessage, IN_FORCE_TOPIC, self._on_plan_in_force, PLAN)
         if follow_sim:
             self.create_subscription(
                 EpisodeState, "sim/boundary", self._on_episode, EPISODE, raw=True
@@ -101,9 +102,13 @@ class CoachLink(Node):
             timeout=ARM_TIMEOUT_S,
         )
         if not answered:
-            return f"no gate armed the plan within {ARM_TIMEOUT_S:g} s"
-        reason = self._refused.get(revision)
-        return "" if reason is None else f"the gate refused: {reason}"
+            problem = f"no gate armed the plan within {ARM_TIMEOUT_S:g} s"
+        else:
+            reason = self._refused.get(revision)
+            problem = "" if reason is None else f"the gate refused: {reason}"
+        # Coaches on one graph overrule each other, gates answer for each other.
+        peers = (several(self._coach, topic) for topic in (PLAN_TOPIC, IN_FORCE_TOPIC))
+        return "; ".join([problem, *filter(None, peers)]) if problem else ""
 
     def settle(self, at_once: bool = True) -> None:
         """Takes over what is in force, with ``changed`` held, and plans what waits for that.

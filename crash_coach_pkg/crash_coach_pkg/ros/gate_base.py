@@ -21,6 +21,7 @@ from crash_coach_common.ros.parameters import (
     choices_text,
     refuse_undeclared,
 )
+from crash_coach_common.ros.peers import several
 from crash_coach_common.ros.qos import EVENTS, PLAN
 from crash_coach_common.ros.run_node import TICK_S
 from crash_coach_pkg.gate.health import Decided, Report, RobotState, TeamHealth
@@ -210,6 +211,8 @@ class GateBase(Node):
             wrong or gate.warning(report.robot),
             listeners,
             f"plan refused: {refusal}" if refusal else "",
+            several(self, "coach/plan"),
+            several(self, self.topics.raw[report.robot]),
         ]
         warning = "; ".join(text for text in warnings if text)
         level, values = _LEVELS[report.state], dict(report.values)

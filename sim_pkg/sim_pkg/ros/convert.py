@@ -234,9 +234,12 @@ def _outline(header: Header, scene: Scene) -> Marker:
 
 
 def diagnostics(
-    decided: Decisions | NewestCommands, session: Session, stamp: Time
+    decided: Decisions | NewestCommands, session: Session, stamp: Time, problems: Sequence[str]
 ) -> DiagnosticArray:
-    """One status per robot: OK, WARN where a plan faults it, ERROR where it is lost."""
+    """One status per robot: OK, WARN where a plan faults it, ERROR where it is lost.
+
+    ``problems``: what else is wrong about each robot, or '': at least WARN.
+    """
     message = DiagnosticArray()
     message.header.stamp = stamp
     for i, robot in enumerate(session.env.spec.robots):
@@ -250,9 +253,11 @@ def diagnostics(
         }
         message.status.append(
             DiagnosticStatus(
-                level=_LEVELS[state],
+                level=max(
+                    _LEVELS[state], DiagnosticStatus.WARN if problems[i] else DiagnosticStatus.OK
+                ),
                 name=f"sim: {robot}",
-                message=state.value,
+                message="; ".join(filter(None, (state.value, problems[i]))),
                 hardware_id=robot,
                 values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
             )

@@ -218,7 +218,7 @@ class SimNode(Node):
 
     def _fail(self, text: str) -> None:
         """Ends the episode loudly: readers see it cut short, the process exits with an error."""
-        self.failure = text
+        self.failure = "; ".join(filter(None, (text, self._topics.rivals())))
         self._decisions.close()
         if self._session.running:
             self._session.cut()

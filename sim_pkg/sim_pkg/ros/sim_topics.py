@@ -16,6 +16,7 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from crash_coach_common.contract import EnvSpec
+from crash_coach_common.ros.peers import several
 from sim_pkg.lockstep import Decisions
 from sim_pkg.realtime import NewestCommands
 from sim_pkg.ros import convert
@@ -130,7 +131,16 @@ class SimTopics:
     def publish_diagnostics(self, decided: Decisions | NewestCommands, session: Session) -> None:
         """Stamped with wall time: it is about processes, not about the simulated world."""
         stamp = self._node.get_clock().now().to_msg()
-        self._diagnostics_pub.publish(convert.diagnostics(decided, session, stamp))
+        sims = self.rivals()
+        problems = [
+            "; ".join(filter(None, (sims, several(self._node, f"{robot}/command"))))
+            for robot in self._spec.robots
+        ]
+        self._diagnostics_pub.publish(convert.diagnostics(decided, session, stamp, problems))
+
+    def rivals(self) -> str:
+        """Who else plays the sim here; '' where nobody does."""
+        return several(self._node, EPISODE_TOPIC)
 
     def flush(self) -> None:
         """Waits, within bounds, until every reader has the last episode state."""
