@@ -7,6 +7,7 @@ import signal
 from collections.abc import Iterator
 
 import pytest
+from hypothesis import settings
 
 from crash_coach_bringup.ros import discovery
 from crash_coach_bringup.ros.domain import reserve_domain
@@ -14,6 +15,10 @@ from crash_coach_bringup.ros.domain import reserve_domain
 # Where the suite runs in the background of a shell, Ctrl-C is ignored, by all that it starts too.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# How long an example takes says how busy the machine is.
+settings.register_profile("here", deadline=None)
+settings.load_profile("here")
 
 
 @pytest.fixture

@@ -38,4 +38,4 @@ def crash_coach(folder: Path, line: str, *more: str) -> subprocess.CompletedProc
     command = [str(find_executable("crash_coach_bringup", program)), *arguments, *more]
     paths = [str(folder), os.environ.get("PYTHONPATH", "")]
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
-    return subprocess.run(command, capture_output=True, text=True, timeout=90, env=env)
+    return subprocess.run(command, capture_output=True, text=True, timeout=250, env=env)

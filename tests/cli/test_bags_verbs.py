@@ -118,7 +118,7 @@ def test_record_is_the_recorder(tmp_path: Path, ros_env: dict[str, str]) -> None
     assert child.stderr is not None
     assert "recording" in child.stderr.readline()
     child.send_signal(signal.SIGINT)
-    out, _ = child.communicate(timeout=20)
+    out, _ = child.communicate(timeout=100)
     assert child.returncode == 0
     assert "0 messages" in out
     text = (tmp_path / "bag" / "metadata.yaml").read_text()

@@ -26,7 +26,7 @@ def crash_coach(
 ) -> subprocess.CompletedProcess[str]:
     """Runs the installed command."""
     command = [str(find_executable("crash_coach_bringup", "crash-coach")), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=90, env=env)
+    return subprocess.run(command, capture_output=True, text=True, timeout=250, env=env)
 
 
 @pytest.fixture(scope="module")
@@ -232,6 +232,11 @@ def test_misspelt_key_writes_nothing(tmp_path: Path) -> None:
 def test_inject_needs_exactly_one_intention() -> None:
     assert "--victims" in refused("inject")
     assert "--clear" in refused("inject", "--clear", "--victims", "robot_1")
+
+
+def test_a_pace_is_for_lock_step() -> None:
+    fast = ("--mode", "realtime", "--pace-hz", "5")
+    assert "--pace-hz 5: real time" in refused("up", "buttons", "--policy", "scripted:hold", *fast)
 
 
 def test_inject_without_a_coach_says_so(ros_env: dict[str, str]) -> None:

@@ -36,7 +36,7 @@ def test_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "in 1,000 steps: action values 0.0e+00, hidden state 0.0e+00" in said[1]
     assert "100.0 %" in said[3]
     code = [sys.executable, "-W", "ignore", "-c", block("python")]
-    ran = subprocess.run(code, capture_output=True, text=True, timeout=60)
+    ran = subprocess.run(code, capture_output=True, text=True, timeout=250)
     assert ran.returncode == 0, ran.stderr
     names = r"'(up|down|left|right|stay)'"
     assert re.fullmatch(rf"\[{names}, {names}\]\n", ran.stdout), ran.stdout

@@ -284,7 +284,7 @@ def test_list_names_every_shipped_file() -> None:
 
 def crash_coach(*arguments: str) -> subprocess.CompletedProcess[str]:
     command = [str(find_executable("crash_coach_bringup", "crash-coach")), "faults", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=90)
+    return subprocess.run(command, capture_output=True, text=True, timeout=250)
 
 
 def test_the_installed_command_exits_with_the_verdict(tmp_path: Path) -> None:

@@ -112,10 +112,10 @@ def test_standard_output_by_its_name(tmp_path: Path, team: Path, to_a_file: bool
     out = tmp_path / "out"
     if to_a_file:
         with out.open("wb") as file:
-            subprocess.run(command, stdout=file, check=True, timeout=90)
+            subprocess.run(command, stdout=file, check=True, timeout=250)
         text = out.read_text()
     else:
-        text = subprocess.run(command, capture_output=True, check=True, timeout=90).stdout.decode()
+        text = subprocess.run(command, capture_output=True, check=True, timeout=250).stdout.decode()
     content, end = json.JSONDecoder().raw_decode(text)
     assert content["scenario"] == "buttons"
     assert "trajectory hash" in text[end:]
@@ -152,7 +152,7 @@ def test_characters_degrade_and_files_are_written(
     command = [sys.executable, "-m", "crash_coach_bringup.cli.main", "evaluate", str(team)]
     command += ["--episodes", "2", "--crashed", "0", "1", "--json", str(result)]
     env = {**os.environ, "PYTHONIOENCODING": encoding}
-    done = subprocess.run(command, capture_output=True, env=env, timeout=90)
+    done = subprocess.run(command, capture_output=True, env=env, timeout=250)
     assert done.returncode == 0, done.stderr
     plus_minus = {"ascii": "+/-", "iso-8859-1": "±"}[encoding]
     assert f"-20.00 {plus_minus} 0.00" in done.stdout.decode(encoding)

@@ -35,7 +35,7 @@ def crash_coach(site: Path, *arguments: str) -> subprocess.CompletedProcess[str]
     command = [str(find_executable("crash_coach_bringup", "crash-coach")), *arguments]
     paths = [str(site), os.environ.get("PYTHONPATH", "")]
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
-    return subprocess.run(command, capture_output=True, text=True, timeout=110, env=env)
+    return subprocess.run(command, capture_output=True, text=True, timeout=250, env=env)
 
 
 def patrol(folder: Path, reward_company: float) -> Path:

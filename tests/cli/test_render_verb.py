@@ -28,7 +28,7 @@ RANDOM = ("scripted:random", "--scenario", "buttons")
 
 def crash_coach(*arguments: str) -> subprocess.CompletedProcess[str]:
     command = [str(find_executable("crash_coach_bringup", "crash-coach")), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=90)
+    return subprocess.run(command, capture_output=True, text=True, timeout=250)
 
 
 def render(*arguments: str) -> str:

@@ -125,7 +125,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path) -> None:
             assert time.monotonic() < end_s
             time.sleep(0.2)
         process.send_signal(signal.SIGINT)
-        said, _ = process.communicate(timeout=130)
+        said, _ = process.communicate(timeout=250)
     finally:
         process.kill()
     assert process.returncode == 130, said

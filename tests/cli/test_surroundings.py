@@ -77,7 +77,7 @@ def test_a_signal_is_one_line_at_any_moment(team: str, number: int, after_s: flo
         time.sleep(0.01)
     time.sleep(after_s)
     process.send_signal(number)
-    out, said = process.communicate(timeout=60)
+    out, said = process.communicate(timeout=250)
     assert process.returncode == 128 + number
     assert said == f"crash-coach: {'interrupted' if number == signal.SIGINT else 'terminated'}\n"
     assert out == ""

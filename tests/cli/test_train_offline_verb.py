@@ -65,7 +65,7 @@ def trained(*arguments: str | Path) -> str:
     """What the installed command prints; it must succeed."""
     command = [find_executable("crash_coach_bringup", "crash-coach"), "train-offline", *arguments]
     done = subprocess.run(
-        [str(part) for part in command], capture_output=True, text=True, timeout=100
+        [str(part) for part in command], capture_output=True, text=True, timeout=250
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout

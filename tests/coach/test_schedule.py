@@ -61,7 +61,6 @@ SOME_FAULTS = st.lists(FAULTS, min_size=1, max_size=6).map(tuple)
 SEEDS = st.integers(0, 2**63 - 1)
 
 
-@settings(deadline=None)
 @given(st.lists(st.integers(0, STEPS), min_size=2, max_size=2), st.integers(0, 12))
 def test_a_start_step_and_a_duration_say_it_all(starts: list[int], duration: int) -> None:
     crash = plan(*(Fault(i, "mute", start, duration) for i, start in enumerate(starts)), cap=0)
@@ -75,7 +74,7 @@ def test_a_start_step_and_a_duration_say_it_all(starts: list[int], duration: int
             assert in_force == expected
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(SOME_FAULTS, SEEDS)
 def test_every_stretch_lasts_its_duration_and_begins_no_earlier_than_its_start_step(
     faults: tuple[Fault, ...], seed: int
@@ -94,7 +93,7 @@ def test_every_stretch_lasts_its_duration_and_begins_no_earlier_than_its_start_s
                 assert history[later][place] == since
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(SOME_FAULTS, SEEDS, st.integers(0, N))
 def test_triggers_never_exceed_the_cap(faults: tuple[Fault, ...], seed: int, cap: int) -> None:
     """Where the start steps alone keep it, nothing breaks it."""
@@ -118,7 +117,7 @@ def test_a_trigger_waits_for_room_and_leaves_room_for_start_steps() -> None:
     assert [robots(endless, f) for f in follow(endless, 8)] == [set()] * 6 + [{0}] * 2
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(SOME_FAULTS, SEEDS)
 def test_conditions_fire_once_at_the_first_step_that_meets_them(
     faults: tuple[Fault, ...], seed: int
@@ -142,7 +141,7 @@ def test_conditions_fire_once_at_the_first_step_that_meets_them(
         assert begun == set(met[:1])
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(SOME_FAULTS, SEEDS, st.sets(st.integers(0, STEPS - 1), min_size=1))
 def test_skipping_steps_changes_nothing_without_conditions(
     faults: tuple[Fault, ...], seed: int, entered: set[int]

@@ -26,7 +26,7 @@ from policy_pkg.play.conditions import crash_free, named
 from policy_pkg.play.evaluate import Scripted, evaluate, evaluation_seed
 from policy_pkg.play.target import load_target
 
-WAIT_S = 30.0
+WAIT_S = 60.0
 SCENARIO, KITE = "skirmish/3s_vs_5z", "scripted:kite"
 KEY = evaluation_seed(4)
 

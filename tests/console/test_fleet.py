@@ -25,7 +25,7 @@ from crash_coach_console.ros.convert import event_kind, yaw_rad
 from crash_coach_console.ros.graph_source import GraphSource
 
 ROVERS = ("rover_east", "rover_west")
-WAIT_S = 30.0
+WAIT_S = 60.0
 
 
 def test_robots_are_drawn_where_they_say_they_are() -> None:

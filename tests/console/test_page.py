@@ -252,7 +252,7 @@ def test_random_messages_get_an_error_each_and_leave_a_valid_coach(
     with asking(teams.one) as ask:
 
         @seed(11)
-        @settings(max_examples=count, deadline=None, database=None)
+        @settings(max_examples=count, database=None)
         @given(messages())
         def send(text: str) -> None:
             answer = ask.text(text)

@@ -26,7 +26,7 @@ from crash_coach_console.serve import page_url
 from crash_coach_console.server import Server, make_app
 from policy_pkg.play.target import load_target
 
-WAIT_S = 20.0
+WAIT_S = 60.0
 WEB = Path(crash_coach_console.__file__).parent / "web"
 TOKEN = "an-open-sesame-for-tests"
 

@@ -146,5 +146,5 @@ def test_onnx_and_safetensors_need_no_torch(tmp_path: Path) -> None:
         f"Path({str(tmp_path)!r}) / kind)\n"
         "sys.exit('torch' in sys.modules)"
     )
-    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+    assert subprocess.run([sys.executable, "-c", code], timeout=250).returncode == 0
     assert json.loads((tmp_path / "onnx/policy.json").read_text())["action_names"] is None

@@ -217,4 +217,4 @@ def test_epsilon_zero_is_greedy_and_one_is_uniform() -> None:
 
 def test_acting_does_not_load_torch() -> None:
     code = "import sys, policy_pkg.checkpoint, policy_pkg.act; sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+    assert subprocess.run([sys.executable, "-c", code], timeout=250).returncode == 0

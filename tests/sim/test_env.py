@@ -56,7 +56,7 @@ def test_same_bits_in_another_process() -> None:
         "from sim_pkg.trajectory import combine; print(combine(test_env.hashes(4, 16)))"
     )
     other = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=250
     )
     assert other.stdout.strip() == combine(hashes(16, 16))
 

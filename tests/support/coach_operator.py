@@ -16,7 +16,7 @@ from std_srvs.srv import Trigger
 
 from crash_coach_bringup.ros.client import greet
 
-WAIT_S = 20.0
+WAIT_S = 60.0
 
 
 def close(executor: EventsExecutor, node: Node, context: Context) -> None:

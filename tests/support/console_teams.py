@@ -50,7 +50,7 @@ from sim_pkg.env import make_env
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
-WAIT_S = 20.0
+WAIT_S = 60.0
 SCENARIO = "buttons"
 
 

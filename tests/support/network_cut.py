@@ -41,7 +41,7 @@ SCENARIO = "buttons"
 NEAR, FAR = "robot_1", "robot_2"
 PERIOD_S = 0.2  # of control steps
 CMD_TIMEOUT_S = 3 * PERIOD_S
-WAIT_S = 15.0
+WAIT_S = 60.0
 MOVING_SEED = 2  # weights with which both robots keep moving
 STILL_STEPS = 5  # so many stays in a row are no policy's choice
 

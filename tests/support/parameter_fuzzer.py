@@ -20,7 +20,7 @@ from rcl_interfaces.srv import (
 from rclpy.executors import Executor
 from rclpy.node import Node
 
-WAIT_S = 20.0
+WAIT_S = 60.0
 FIELDS = {
     ParameterType.PARAMETER_BOOL: "bool_value",
     ParameterType.PARAMETER_INTEGER: "integer_value",

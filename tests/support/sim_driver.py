@@ -24,7 +24,7 @@ from crash_coach_bringup.ros.client import greet
 Env = dict[str, str]
 ROBOTS = ("robot_1", "robot_2")
 UP, DOWN, LEFT, RIGHT, STAY = range(5)
-WAIT_S = 20.0
+WAIT_S = 60.0
 
 
 @contextmanager

@@ -27,7 +27,7 @@ EPISODE_TOPIC = "sim/episode"
 # The same, only where an episode begins or ends: the coach need not wake at every step.
 BOUNDARY_TOPIC = "sim/boundary"
 EVENTS_TOPIC = "coach/events"
-_ACK_TIMEOUT_S = 2.0
+_ACK_TIMEOUT_S = 5.0
 
 
 def _reliable(depth: int) -> QoSProfile:
@@ -143,5 +143,6 @@ class SimTopics:
         return several(self._node, EPISODE_TOPIC)
 
     def flush(self) -> None:
-        """Waits, within bounds, until every reader has the last episode state."""
-        self._episode_pub.wait_for_all_acked(Duration(seconds=_ACK_TIMEOUT_S))
+        """Waits, within bounds, until every reader has the last episode state and boundary."""
+        for publisher in (self._episode_pub, self._boundary_pub):
+            publisher.wait_for_all_acked(Duration(seconds=_ACK_TIMEOUT_S))

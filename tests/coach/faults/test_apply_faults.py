@@ -59,7 +59,7 @@ def test_every_key_counts() -> None:
     assert len({int(b[0]) for b in (base, *others)}) == 7
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     teams=st.integers(1, 6),
     robots=st.integers(1, 5),

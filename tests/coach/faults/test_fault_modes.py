@@ -61,7 +61,7 @@ def wanted(stream: Commands) -> list[int]:
     return [action for action, _ in stream]
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(commands(), st.integers(0, 10), st.integers(1, 10))
 def test_mute_withholds_its_steps_and_only_them(stream: Commands, start: int, steps: int) -> None:
     got = passed("mute", stream, start, steps)
@@ -70,7 +70,7 @@ def test_mute_withholds_its_steps_and_only_them(stream: Commands, start: int, st
     assert got[start + steps :] == wanted(stream)[start + steps :]
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(commands(), SEEDS)
 def test_random_is_available_and_follows_from_the_seed(stream: Commands, seed: int) -> None:
     got = passed("random", stream, seed=seed)
@@ -82,7 +82,7 @@ def test_random_is_available_and_follows_from_the_seed(stream: Commands, seed: i
     assert got != passed("random", stream, seed=seed ^ 1)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(commands(), st.integers(0, 10))
 def test_freeze_repeats_the_last_command_where_it_is_available(
     stream: Commands, start: int
@@ -92,7 +92,7 @@ def test_freeze_repeats_the_last_command_where_it_is_available(
     assert passed("freeze", stream, start)[start:] == expected
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(commands(), st.integers(0, 8), st.integers(1, 30), st.integers(1, 12))
 def test_delay_passes_on_what_was_wanted_so_many_steps_ago(
     stream: Commands, start: int, late: int, steps: int
@@ -128,7 +128,7 @@ def losses(seed: int, steps: int, **odds: float) -> np.ndarray:
     return np.array([action is None for action in got])
 
 
-@settings(deadline=None, max_examples=10)
+@settings(max_examples=10)
 @given(SEEDS)
 def test_drop_in_single_steps_loses_its_share(seed: int) -> None:
     assert not losses(seed, 50, probability=0.0).any()
@@ -231,7 +231,7 @@ def seen(mode: str, sights: np.ndarray, start: int, steps: int, **parameters: fl
     return np.stack(got)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     st.sampled_from(["blind", "stale", "noise"]),
     st.integers(0, 2**32),

@@ -36,7 +36,7 @@ def in_table(plan: CrashPlan, step: int) -> list[Fault | None]:
     return table
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(
     st.lists(STATIC, max_size=6).map(tuple),
     st.integers(0, 2**63 - 1),

@@ -89,7 +89,7 @@ def check(lockstep: bool, relays: bool, played: list[tuple[str, object]], by_lea
     assert all(s.features is None for s in sights)
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(lockstep=st.booleans(), relays=st.booleans(), played=operations, by_lease=st.booleans())
 def test_effects_equal_the_plan_and_a_clear_or_a_lapse_lets_everything_pass(
     lockstep: bool, relays: bool, played: list[tuple[str, object]], by_lease: bool
@@ -99,7 +99,7 @@ def test_effects_equal_the_plan_and_a_clear_or_a_lapse_lets_everything_pass(
 
 @pytest.mark.soak
 @pytest.mark.timeout(1800)
-@settings(deadline=None, max_examples=10_000)
+@settings(max_examples=10_000)
 @given(lockstep=st.booleans(), relays=st.booleans(), played=operations, by_lease=st.booleans())
 def test_ten_thousand_runs(
     lockstep: bool, relays: bool, played: list[tuple[str, object]], by_lease: bool

@@ -221,7 +221,7 @@ acts: st.SearchStrategy[Act] = st.one_of(
 histories = st.lists(st.tuples(acts, st.sampled_from((0.0, 0.3, 1.0, 4.0))), max_size=60)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(histories, st.booleans())
 def test_laws_of_any_history(history: list[tuple[Act, float]], by_lease: bool) -> None:
     check(history, by_lease)
@@ -229,7 +229,7 @@ def test_laws_of_any_history(history: list[tuple[Act, float]], by_lease: bool) -
 
 @pytest.mark.soak
 @pytest.mark.timeout(1800)
-@settings(deadline=None, max_examples=10_000)
+@settings(max_examples=10_000)
 @given(histories, st.booleans())
 def test_ten_thousand_histories(history: list[tuple[Act, float]], by_lease: bool) -> None:
     check(history, by_lease)

@@ -57,7 +57,7 @@ def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str]) -> N
 def kill(process: subprocess.Popen[str], out: Path) -> None:
     """SIGKILL to the whole process group; what it started must not run on."""
     os.killpg(process.pid, signal.SIGKILL)
-    process.communicate(timeout=30)
+    process.communicate(timeout=100)
     deadline = time.monotonic() + 20
     while processes_of(out):
         assert time.monotonic() < deadline, f"{processes_of(out)} run on unseen"
@@ -77,7 +77,7 @@ def test_a_killed_sweep_ends_with_the_same_results(tmp_path: Path) -> None:
     wait_for(lambda: steps(runs, out) > 0, process)
     kill(process, out)
     done = start(tmp_path / "sweep.yaml", out)
-    assert "all 1 runs are finished" in done.communicate(timeout=100)[0]
+    assert "all 1 runs are finished" in done.communicate(timeout=250)[0]
     assert done.returncode == 0
     assert_same_results(runs, out, tmp_path / "alone")
     before = {p: p.stat().st_mtime_ns for p in (out / "buttons").rglob("*")}
@@ -145,7 +145,7 @@ def test_a_foreign_folder_fails_alone(tmp_path: Path) -> None:
     foreign.parent.mkdir(parents=True)
     foreign.write_text("mine")
     process = start(tmp_path / "sweep.yaml", out)
-    output = process.communicate(timeout=100)[0]
+    output = process.communicate(timeout=250)[0]
     assert process.returncode == 1
     assert "qmix-s0 is not empty and holds no run" in output
     assert "1 of 2 runs failed; mend them, then crash-coach sweep" in output
@@ -161,7 +161,7 @@ def test_a_stopped_sweep_says_how_to_go_on(tmp_path: Path, number: signal.Signal
     process = start(path, tmp_path / "out")
     wait_for(lambda: len(processes_of(tmp_path / "out")) >= 3, process)
     os.killpg(process.pid, number)
-    output = process.communicate(timeout=30)[0]
+    output = process.communicate(timeout=100)[0]
     assert process.returncode == 128 + number
     assert "stopped; 2 of 2 runs are left" in output
     assert "Traceback" not in output

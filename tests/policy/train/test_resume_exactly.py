@@ -174,7 +174,7 @@ def test_every_setting_of_the_recipe_goes_on_where_it_was(tmp_path: Path) -> Non
     process = start(run, config)
     wait_until_lines(run, 5, process)
     os.kill(process.pid, signal.SIGKILL)
-    assert process.wait(timeout=30) == -signal.SIGKILL
+    assert process.wait(timeout=100) == -signal.SIGKILL
     assert read_manifest(find_checkpoint(run)).progress["env_steps"] < 1600
     train(config, run, resume=True)
     assert_same_run(run, tmp_path / "whole")
@@ -210,7 +210,7 @@ def test_sigkill_and_resume_changes_no_bit(whole: Path, tmp_path: Path) -> None:
     process = start(run)
     wait_until_lines(run, 7, process)
     os.kill(process.pid, signal.SIGKILL)
-    assert process.wait(timeout=30) == -signal.SIGKILL
+    assert process.wait(timeout=100) == -signal.SIGKILL
     killed_at = read_manifest(find_checkpoint(run)).progress["env_steps"]
     assert 400 <= killed_at < CONFIG.total_steps
     train(CONFIG, run, resume=True)

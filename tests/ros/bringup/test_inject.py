@@ -18,7 +18,7 @@ from crash_coach_common.contract import UserError
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 
-WAIT_S = 30.0
+WAIT_S = 60.0
 PACE_HZ = 100.0
 
 

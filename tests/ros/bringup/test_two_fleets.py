@@ -24,7 +24,7 @@ from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 from sim_pkg.ros.sim_lock import SecondSimError, only_sim
 
-WAIT_S = 30.0
+WAIT_S = 60.0
 OURS, TWISTS = "fleet_a", "fleet_b"
 ROVERS = ("robot_1", "robot_2")  # the same names: only the namespace tells them from ours
 OF_ROS = ("/rosout", "/parameter_events")

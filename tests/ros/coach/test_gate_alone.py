@@ -52,6 +52,6 @@ def test_twist_commands_too(ros_env: dict[str, str], tmp_path: Path) -> None:
 
 def test_the_wall_is_there(ros_env: dict[str, str], tmp_path: Path) -> None:
     with process(bare(ros_env, tmp_path), "sim", "sim_pkg", scenario="buttons") as sim:
-        _, said = sim.communicate(timeout=60)
+        _, said = sim.communicate(timeout=250)
     assert sim.returncode != 0
     assert "not installed here" in said

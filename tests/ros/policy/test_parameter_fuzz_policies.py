@@ -51,7 +51,7 @@ class Fuzzed:
 
     def end(self) -> str:
         self.process.send_signal(signal.SIGINT)
-        said, _ = self.process.communicate(timeout=20)
+        said, _ = self.process.communicate(timeout=100)
         assert self.process.returncode == 0, said
         return said
 

@@ -220,7 +220,7 @@ def test_sigterm_ends_the_file(tmp_path: Path, ros_env: dict[str, str]) -> None:
     assert child.stderr is not None
     assert "recording" in child.stderr.readline()
     child.send_signal(signal.SIGTERM)
-    out, err = child.communicate(timeout=20)
+    out, err = child.communicate(timeout=100)
     assert (child.returncode, err) == (0, "")
     assert out.startswith("recorder: 0 messages, 0 episodes")
     assert (tmp_path / "bag" / "bag_0.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")
@@ -240,7 +240,7 @@ def test_wrong_parameters_are_one_line(
     tmp_path: Path, ros_env: dict[str, str], parameters: dict[str, object], text: str
 ) -> None:
     child = start(tmp_path / "bag", ros_env, parameters)
-    _, err = child.communicate(timeout=20)
+    _, err = child.communicate(timeout=100)
     assert child.returncode == 1
     assert err.count("\n") == 1
     assert text in err

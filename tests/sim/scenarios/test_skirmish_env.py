@@ -187,7 +187,7 @@ def test_same_bits_in_another_process() -> None:
     )
     other = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True,
-        check=True, timeout=60,
+        check=True, timeout=250,
     )  # fmt: skip
     assert other.stdout.strip() == combine(hashes("3s_vs_5z", 8, 8))
 

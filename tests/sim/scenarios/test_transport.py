@@ -81,10 +81,11 @@ def overlap_with_box(env: Env) -> np.ndarray:
     return depth
 
 
-def test_ten_thousand_rough_steps() -> None:
+@pytest.mark.parametrize("arenas", [16, pytest.param(64, marks=pytest.mark.soak)])
+def test_thousands_of_rough_steps(arenas: int) -> None:
     """The reference with every third action at random, and long random rides: nothing overlaps,
     tunnels, leaves the arena or its bounds, and nothing is faster than a drive makes it."""
-    arenas, rng = 64, np.random.default_rng(3)
+    rng = np.random.default_rng(3)
     env = make_env("transport", arenas)
     team = make_scripted("transport_direct", env)
     env.reset(np.arange(arenas), 5, np.arange(arenas))

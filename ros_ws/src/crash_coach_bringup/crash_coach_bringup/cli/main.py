@@ -82,8 +82,8 @@ def main() -> None:
         os.environ.setdefault(name, "1")
     degrade_characters()
     try:
+        app = typed_app(sys.argv[1:])  # loads libraries: a signal still ends it at once
         with signals.raised():
-            app = typed_app(sys.argv[1:])
             app(args=repeat_options(sys.argv[1:], app))
     except UserError as error:
         _fail(f"error: {error}")

@@ -15,6 +15,7 @@ from crash_coach_console.episodes import Costs, EpisodeBook, Played
 from crash_coach_console.ros.convert import event_kind
 
 LISTEN_S = 0.02
+REST_S = 5.0  # at most, after the graph's end
 
 
 class Episodes:
@@ -24,6 +25,7 @@ class Episodes:
         self.costs = Costs()
         self._client = client
         self._book = EpisodeBook()
+        self._heard = 0  # messages
         sub = client.node.create_subscription
         # Latched: the first episode may begin before this node is known to the sim.
         latched = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -36,8 +38,11 @@ class Episodes:
         yield from self._give(self._book.settled(time.monotonic()))
 
     def rest(self) -> Iterator[Played]:
-        """At the end: nothing more is awaited."""
-        self._client.pause(LISTEN_S)
+        """At the end, once nothing more comes: on a busy machine much may wait to be heard."""
+        end_s, heard = time.monotonic() + REST_S, -1
+        while heard != self._heard and time.monotonic() < end_s:
+            heard = self._heard
+            self._client.pause(LISTEN_S)
         yield from self._give(self._book.settled(time.monotonic(), 0.0))
 
     def _give(self, found: Iterator[Played]) -> Iterator[Played]:
@@ -46,6 +51,7 @@ class Episodes:
             yield played
 
     def _on_boundary(self, state: EpisodeState) -> None:
+        self._heard += 1
         if state.terminated or state.truncated:
             now_s = time.monotonic()
             self._book.end(state.episode, state.success, state.episode_return, state.step, now_s)
@@ -53,6 +59,7 @@ class Episodes:
             self._book.begin(state.episode)
 
     def _on_event(self, data: bytes) -> None:
+        self._heard += 1
         # There is an EFFECT for every faulted robot-step; where faults begin, an ACTIVE tells it.
         if event_kind(data) == FaultEvent.ACTIVE:
             event = deserialize_message(data, FaultEvent)

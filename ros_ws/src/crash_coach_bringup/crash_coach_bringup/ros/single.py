@@ -6,7 +6,11 @@ command line. Only the coach's parameter services run in a thread of their own, 
 
 from __future__ import annotations
 
+import json
+import os
+import re
 import sys
+from typing import Any
 
 from crash_coach_common.contract import UserError
 from crash_coach_common.ros.run_node import run, serving
@@ -14,10 +18,36 @@ from crash_coach_pkg.ros import coach_node, gate_node
 from policy_pkg.ros.team_node import TeamNode
 from sim_pkg.ros.sim_node import SimNode
 
+_OF_NODE = re.compile(r"(?P<node>\w+):(?P<name>[\w.]+):=(?P<value>.*)", re.DOTALL)
+
 
 def main() -> int:
     """The exit code: 0 after the last episode or a signal, 1 after one line of error."""
+    sys.argv[1:] = in_namespace(sys.argv[1:])
     return run(_run, "graph")
+
+
+def in_namespace(arguments: list[str]) -> list[str]:
+    """The same for nodes in a namespace: ``-p <node>:`` means a node without one, and a path is
+    not allowed there, only in a file of parameters. That is one in memory, for this process."""
+    spaces = {text.partition(":=")[2] for text in arguments if text.startswith("__ns:=")}
+    if not spaces:
+        return arguments
+    (space,) = spaces
+    kept: list[str] = []
+    given: dict[str, dict[str, dict[str, Any]]] = {}
+    words = iter(arguments)
+    for word in words:
+        value = next(words) if word == "-p" else ""
+        found = _OF_NODE.fullmatch(value)
+        if found is None:
+            kept += [word, value] if value else [word]
+            continue
+        node = given.setdefault(f"{space}/{found['node']}", {"ros__parameters": {}})
+        node["ros__parameters"][found["name"]] = json.loads(found["value"])
+    memory = os.memfd_create("parameters", 0)
+    os.write(memory, json.dumps(given).encode())
+    return [*kept, "--ros-args", "--params-file", f"/proc/self/fd/{memory}", "--"]
 
 
 def _run(received: list[int]) -> None:

@@ -25,6 +25,10 @@ ConsoleOption = Annotated[bool, typer.Option("--console", help="Also serve the t
 PortOption = Annotated[
     int, typer.Option(help="Port of the page, with --console.", min=1, max=65535)
 ]
+PaceOption = Annotated[
+    float,
+    typer.Option(help="Lock-step: most control steps a second; 0: no limit.", min=0, max=1000),
+]
 
 
 def up(
@@ -38,6 +42,7 @@ def up(
     seed: Annotated[
         int, typer.Option(help="Seed of episodes, crashes and random actions.", min=0)
     ] = 0,
+    pace_hz: PaceOption = 0.0,
     epsilon: Annotated[
         float,
         typer.Option(help="Probability of a random action, per robot and step; 1: a random team."),
@@ -55,9 +60,7 @@ def up(
 
     Says of every episode who was crashed and how it went, and sums up at the end.
     """
-    for name, value in (("epsilon", epsilon), ("crash-rate", crash_rate)):
-        if not 0 <= value <= 1:
-            raise CliError(f"--{name} {value}: a probability from 0 to 1 is needed")
+    _check(mode, pace_hz, {"epsilon": epsilon, "crash-rate": crash_rate})
     from crash_coach_bringup.ros.graph import UpOptions
     from crash_coach_bringup.ros.up import run_up
 
@@ -70,9 +73,19 @@ def up(
         seed=seed,
         epsilon=epsilon,
         coach=at_rate(crash_rate).crash,
+        sim={"pace_hz": pace_hz} if pace_hz else {},
         relay_observations=relay_observations,
         log_dir=logs,
         namespace=namespace,
     )
     with logs_at(logs):
         raise typer.Exit(run_up(options, teller("up"), port if console else None))
+
+
+def _check(mode: Mode, pace_hz: float, probabilities: dict[str, float]) -> None:
+    """Raises CliError where an option's value has no meaning."""
+    for name, value in probabilities.items():
+        if not 0 <= value <= 1:
+            raise CliError(f"--{name} {value}: a probability from 0 to 1 is needed")
+    if pace_hz and mode is Mode.realtime:
+        raise CliError(f"--pace-hz {pace_hz:g}: real time goes by the clock; it is for lock-step")
