@@ -6,6 +6,7 @@ one graph, in turn.
 
 from __future__ import annotations
 
+import shutil
 import statistics
 import subprocess
 import sys
@@ -35,14 +36,14 @@ from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 
 PAIRS = 4
-TARGET_SHARE = 0.9
+TARGET_SHARE, PICTURES_HZ = 0.9, 30.0
 MANY, HZ = 32, 10.0
 Row = dict[str, Any]
 
 
 @contextmanager
-def open_page(domain: int) -> Iterator[psutil.Process]:
-    """A console of its own process, and a page that reads all it is told."""
+def console_of(domain: int) -> Iterator[tuple[str, psutil.Process]]:
+    """The address of a console of its own process."""
     command = [sys.executable, "-m", "crash_coach_console.command", "--port", "0"]
     console = subprocess.Popen(
         [*command, "--domain", str(domain)], stdout=subprocess.PIPE, text=True
@@ -50,6 +51,16 @@ def open_page(domain: int) -> Iterator[psutil.Process]:
     try:
         assert console.stdout is not None
         address = console.stdout.readline().removeprefix("console: http://").strip()
+        yield address, psutil.Process(console.pid)
+    finally:
+        console.terminate()
+        console.wait()
+
+
+@contextmanager
+def open_page(domain: int) -> Iterator[psutil.Process]:
+    """A console, and a page that reads all it is told."""
+    with console_of(domain) as (address, process):
         stop, drawn = threading.Event(), threading.Event()
 
         def read() -> None:
@@ -62,12 +73,9 @@ def open_page(domain: int) -> Iterator[psutil.Process]:
         reader.start()
         if not drawn.wait(START_S):
             raise RuntimeError("the console showed nothing")
-        yield psutil.Process(console.pid)
+        yield process
         stop.set()
         reader.join()
-    finally:
-        console.terminate()
-        console.wait()
 
 
 def rate(client: Any, supervisor: Supervisor, dt_s: float) -> float:
@@ -162,8 +170,65 @@ def share_row(folder: Path) -> Row:
     }
 
 
+# Pictures in which some robot stands elsewhere than in the one before, of the page's first stage.
+COUNT = """(seconds) => new Promise((done) => {
+  const stage = crashCoach.stages[0], began = performance.now();
+  let before = "", pictures = 0, frames = 0;
+  const look = () => {
+    const places = JSON.stringify(stage.places().map((place) => [place.x, place.y]));
+    if (places !== before) pictures += 1;
+    before = places;
+    frames += 1;
+    const passed = (performance.now() - began) / 1000;
+    if (passed < seconds) requestAnimationFrame(look);
+    else done([pictures / passed, frames / passed]);
+  };
+  requestAnimationFrame(look);
+})"""
+
+
+def frames_row(folder: Path) -> Row:
+    """Real time, MANY robots that move at random, in a headless browser without a graphics card."""
+    from playwright.sync_api import sync_playwright
+
+    with ExitStack() as stack:
+        scenario, sim = str(many_robots(folder)), {"real_time_factor": HZ}
+        domain, client, supervisor, dt_s = running(
+            stack, folder, scenario, mode="realtime", sim=sim, epsilon=1.0
+        )
+        sample(client, dt_s)
+        address, _ = stack.enter_context(console_of(domain))
+        playwright = stack.enter_context(sync_playwright())
+        browser = playwright.chromium.launch(
+            executable_path=chromium(), args=["--no-sandbox", "--disable-gpu"]
+        )
+        page = browser.new_page(viewport={"width": 1600, "height": 1000})
+        page.goto(f"http://{address}")
+        page.wait_for_function(
+            "() => crashCoach.stages.length && crashCoach.stages[0].places().length > 0",
+            timeout=1000 * START_S,
+        )
+        refuse_dead(supervisor, WARM_UP_S)
+        pictures_hz, frames_hz = page.evaluate(COUNT, WINDOW_S)
+        browser.close()
+    return {
+        "name": f"console pictures, {MANY} robots moving at {HZ:g} Hz, headless browser",
+        "value": round(pictures_hz, 1),
+        "unit": "pictures/s",
+        "reference": round(frames_hz, 1),  # what the browser's own clock offered
+        "ratio": round(pictures_hz / frames_hz, 3),
+        "target": f">= {PICTURES_HZ:g}",
+        "ok": pictures_hz >= PICTURES_HZ,
+    }
+
+
+def chromium() -> str | None:
+    return shutil.which("chromium") or shutil.which("chromium-browser")
+
+
 def rows() -> list[Row]:
     """All rows: {name, value, unit, reference, ratio, target, ok}."""
     with tempfile.TemporaryDirectory(prefix="crash_coach_bench_") as text:
         folder = Path(text)
-        return [cost_row(folder), share_row(folder)]
+        made = [cost_row(folder), share_row(folder)]
+        return made if chromium() is None else [*made, frames_row(folder)]
