@@ -14,8 +14,8 @@ PAGE = Path(__file__).resolve().parent.parent.parent / "docs" / "pettingzoo.md"
 
 
 def commands() -> list[str]:
-    (block,) = re.findall(r"```bash\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
-    return [line.removeprefix("crash-coach ") for line in block.splitlines()]
+    blocks = re.findall(r"```bash\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
+    return [line.removeprefix("crash-coach ") for block in blocks for line in block.splitlines()]
 
 
 def scenario_file() -> str:
@@ -27,10 +27,12 @@ def run_page(folder: Path, short: bool) -> None:
     """Types what the page says in ``folder``, and looks at what it leaves."""
     for line in commands():
         if short:
-            line = line.replace("20000", "600").replace("--episodes 64", "--episodes 2")
+            line = re.sub("[24]0000", "600", line).replace("--episodes 64", "--episodes 2")
+            line += " test_episodes=2 n_envs=4" if line.startswith("train ") else ""
         done = typed(*shlex.split(line))
         assert done.returncode == 0, done.stdout + done.stderr
-    assert (folder / "runs/spread.mp4").stat().st_size > 10_000
+    for film in ("spread", "pursuit"):
+        assert (folder / f"runs/{film}.mp4").stat().st_size > 10_000
     assert "simple_spread_v3" in (folder / "runs/spread_report/table.md").read_text()
 
 
@@ -41,6 +43,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.timeout(500)
 def test_the_commands(folder: Path) -> None:
     run_page(folder, short=True)
 
@@ -57,6 +60,9 @@ def test_the_commands_in_their_size_teach_something(folder: Path) -> None:
         assert done.returncode == 0, done.stderr
         returns[team] = json.loads(out.read_text())["conditions"][0]["return_mean"]
     assert returns["runs/spread"] > returns["scripted:random"] + 5
+    out = folder / "pursuit.json"
+    assert typed("evaluate", "runs/pursuit", "--json", str(out)).returncode == 0
+    assert json.loads(out.read_text())["conditions"][0]["success_rate"] > 0.5
 
 
 def test_the_file_is_the_same_scenario(folder: Path) -> None:

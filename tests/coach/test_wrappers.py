@@ -196,6 +196,31 @@ def test_the_example_shows_a_rate_that_rises_and_falls() -> None:
     assert any(later < before for before, later in pairwise(rates))
 
 
+def qmix(*arguments: str) -> list[str]:
+    """What the example of an EPyMARL-style loop prints."""
+    command = [sys.executable, ROOT / "examples/qmix_in_epymarl_style.py", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_the_qmix_example_runs() -> None:
+    lines = qmix("--episodes", "100")
+    assert [line.split(":")[0] for line in lines] == ["episode 0", "episode 100"]
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(1000)
+def test_the_qmix_example_learns_while_agents_crash() -> None:
+    """As docs/wrappers.md says."""
+    lines = qmix()
+    success, rate = (float(lines[-1].split(word)[1].split()[0].rstrip(",")) for word in (
+        "success ", "next crash rate "
+    ))  # fmt: skip
+    assert success > 0.6
+    assert rate > 0.1
+
+
 @pytest.mark.soak
 def test_in_a_bare_environment(tmp_path: Path) -> None:
     """Installed by pip, beside PettingZoo and nothing of ours but the common floor."""

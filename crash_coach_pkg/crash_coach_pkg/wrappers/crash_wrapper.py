@@ -125,6 +125,7 @@ class CrashWrapper(BaseParallelWrapper):  # type: ignore[misc]
             for agent, action in actions.items()
         }
         down = {a: bool(faults.mode(self._agents_of_plan.index(a))) for a in executed}
+        self._crashing([agent for agent in executed if down[agent]])
         observations, rewards, terminations, truncations, infos = self.env.step(executed)
         self._step += 1
         self._return += float(sum(rewards.values()))
@@ -158,6 +159,9 @@ class CrashWrapper(BaseParallelWrapper):  # type: ignore[misc]
         return self.coach.record_block(
             success_rate, Progress(env_steps, total_steps, self._episodes_done)
         )
+
+    def _crashing(self, agents: list[Any]) -> None:
+        """Called before each step with the agents that a fault is in force on, for pictures."""
 
     def _begun(self) -> TeamFaults[int]:
         if self._faults is None:
@@ -209,14 +213,17 @@ def _coach(env: Any, config: CoachConfig | Mapping[str, Any], seed: int, dt_s: f
     names = [re.sub(r"\W", "_", str(agent), flags=re.ASCII) for agent in env.possible_agents]
     robots = tuple(f"agent_{name}" if name[:1].isdigit() else name for name in names)
     roles = tuple(re.sub(r"_?\d+$", "", robot) or robot for robot in robots)
+    return Coach(coach_settings(config), TeamSpec(robots, roles, dt_s), seed)
+
+
+def coach_settings(config: CoachConfig | Mapping[str, Any]) -> CoachConfig:
+    """Raises UserError for an unknown key or a wrong value."""
     if isinstance(config, CoachConfig):
-        settings = config
-    else:
-        try:
-            settings = CoachConfig.model_validate(dict(config))
-        except ValueError as error:
-            raise UserError(f"coach: {error}") from error
-    return Coach(settings, TeamSpec(robots, roles, dt_s), seed)
+        return config
+    try:
+        return CoachConfig.model_validate(dict(config))
+    except ValueError as error:
+        raise UserError(f"coach: {error}") from error
 
 
 def _check_actions(agent: Any, space: Any, stay_action: int) -> None:

@@ -36,6 +36,8 @@ class MultiAgentView(gymnasium.Env[Any, Any]):
 
     def __init__(self, env: Any, stay_action: int, episode_limit: int) -> None:
         self.env = env
+        self.metadata = {"render_modes": [], **getattr(env, "metadata", {})}
+        self.render_mode = getattr(env, "render_mode", None)
         self.agents = list(env.possible_agents)
         self.n_agents = len(self.agents)
         self.episode_limit = episode_limit

@@ -31,6 +31,7 @@ from sim_pkg.render.stage import (
     SIDE_COLOURS,
     SITE_DONE,
     Stage,
+    View,
     box_corners,
     entry,
     letter,
@@ -84,7 +85,9 @@ def write_video(
         raise ValueError(f"{path}: a film is a .mp4 or .gif file")
     write, fps = writers[path.suffix]
     path.parent.mkdir(parents=True, exist_ok=True)
-    film = PictureFilm(frames) if isinstance(frames, Pictures) else _Film(frames, caption)
+    film: Film = (
+        PictureFilm(frames) if isinstance(frames, Pictures) else EpisodeFilm(frames, caption)
+    )
     with whole_output(path) as temporary:
         write(film, _times(frames, fps, speed), temporary)
 
@@ -142,12 +145,16 @@ def _times(frames: Frames | Pictures, fps: int, speed: float) -> npt.NDArray[np.
     return times
 
 
-class _Film:
-    """The stage and the artists that move on it."""
+class EpisodeFilm:
+    """The stage and the artists that move on it.
 
-    def __init__(self, frames: Frames, caption: str) -> None:
+    caption, view: as of Stage; with a view the episode is under way, and the legend has what may
+    yet happen.
+    """
+
+    def __init__(self, frames: Frames, caption: str = "", view: View | None = None) -> None:
         self._frames = frames
-        self._stage = stage = Stage(frames, _legend(frames), caption)
+        self._stage = stage = Stage(frames, _legend(frames, view is not None), caption, view)
         self._discs = [i for i, actor in enumerate(frames.actors) if actor.size_m is None]
         self._boxes = [i for i, actor in enumerate(frames.actors) if actor.size_m is not None]
         self._radii = np.array([frames.actors[i].radius_m for i in self._discs])
@@ -190,8 +197,19 @@ class _Film:
 
     def picture(self, at: float) -> Picture:
         """(H, W, 3) at a time in control steps."""
+        frames, shown = self._frames, int(at)
+        clock = f"step {shown}, {at * frames.dt_s:.1f} s, return {frames.returns[shown]:.2f}"
+        return self._drawn(at, clock if shown < frames.steps else outcome(frames))
+
+    def latest(self, frames: Frames, clock: str) -> Picture:
+        """(H, W, 3) the end of ``frames``, of the episode that this is a film of."""
+        self._frames = frames
+        return self._drawn(float(frames.steps), clock)
+
+    def _drawn(self, at: float, clock: str) -> Picture:
         canvas = self._stage.canvas
         self._arrange(at)
+        self._stage.clock.set_text(clock)
         canvas.restore_region(self._empty)
         for artist in self._moving:
             self._stage.figure.draw_artist(artist)
@@ -222,8 +240,6 @@ class _Film:
         for i, patch in enumerate(self._sites):
             done = frames.sites_done[shown, i]
             patch.set_facecolor(SITE_DONE if done else site_colour(frames.scene, i))
-        clock = f"step {shown}, {at * frames.dt_s:.1f} s, return {frames.returns[shown]:.2f}"
-        self._stage.clock.set_text(clock if shown < frames.steps else outcome(frames))
 
     def _arrange_discs(self, shown: int, now: npt.NDArray[Any]) -> None:
         frames, discs = self._frames, self._discs
@@ -290,10 +306,10 @@ def _where(shown: npt.NDArray[np.bool_], places: npt.NDArray[Any]) -> npt.NDArra
     return np.where(shown[:, None], places, np.nan)
 
 
-def _legend(frames: Frames) -> list[Any]:
+def _legend(frames: Frames, under_way: bool) -> list[Any]:
     edge = {"markeredgecolor": INK}
     out = [entry("robot", color=SIDE_COLOURS[Side.ROBOTS])]
-    if frames.crashed.any():
+    if under_way or frames.crashed.any():
         out.append(entry("crashed robot", markerfacecolor=CRASHED, **edge))
     if frames.indexes(Side.OPPONENTS):
         line = {"linestyle": "-", "marker": "", "linewidth": 3}
@@ -303,7 +319,7 @@ def _legend(frames: Frames) -> list[Any]:
             out.append(entry("shield", color=SHIELD, **line))
     if frames.hits.any():
         out.append(entry("being hit", color=HIT))
-    if not frames.alive[-1].all():
+    if not frames.alive[-1].all() or (under_way and frames.indexes(Side.OPPONENTS)):
         out.append(entry("dead", marker="x", color=INK, markeredgewidth=2.4))
     out += scene_entries(frames)
     if frames.scene.sites_m:

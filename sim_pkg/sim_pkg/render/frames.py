@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -112,6 +112,16 @@ class Recorder:
         self._damage.append(self._env.hits[self._arena].copy())
         self._returns.append(self._returns[-1] + reward)
         self._look()
+
+    def so_far(self) -> Frames:
+        """What was gathered of an episode under way; before its first step, a step at rest."""
+        if self._faults:
+            return self.finish(False, "")
+        n = self._env.spec.n_robots
+        still = Recorder(self._env, self._arena, *self._key)
+        unknown = np.full(n, -1)
+        still.step(unknown, unknown, np.zeros(n, dtype=np.uint8), 0.0)
+        return replace(still.finish(False, ""), damage=np.zeros_like(still._all_damage()))
 
     def finish(self, success: bool, trajectory_hash: str) -> Frames:
         """What was gathered, when the episode has ended."""

@@ -71,10 +71,13 @@ class Stage:
 
     Args:
         caption: who acts, and what happens to whom: a line above the episode's own.
+        view: what is shown; None: where the episode took place.
     """
 
-    def __init__(self, frames: Frames, legend: Sequence[Any], caption: str = "") -> None:
-        self.view = view_of(frames)
+    def __init__(
+        self, frames: Frames, legend: Sequence[Any], caption: str = "", view: View | None = None
+    ) -> None:
+        self.view = view_of(frames) if view is None else view
         x1, y1, x2, y2 = self.view
         inner = WIDTH_IN - 2 * MARGIN_IN
         tall = inner * (y2 - y1) / (x2 - x1)
