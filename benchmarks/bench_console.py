@@ -6,6 +6,7 @@ one graph, in turn.
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import statistics
 import subprocess
@@ -20,6 +21,7 @@ from typing import Any
 
 import psutil
 import yaml
+from crash_coach_interfaces.msg import FaultEvent
 from websockets.sync.client import connect
 
 from benchmarks.bench_ros import START_S, WARM_UP_S, WINDOW_S, refuse_dead, sample
@@ -38,6 +40,7 @@ from sim_pkg.env import make_env
 PAIRS = 4
 TARGET_SHARE, PICTURES_HZ = 0.9, 30.0
 MANY, HZ = 32, 10.0
+FLOOD_HZ, BURST_S = 2000.0, 0.02
 Row = dict[str, Any]
 
 
@@ -144,6 +147,57 @@ def many_robots(folder: Path) -> Path:
     return path
 
 
+def share_of(console: psutil.Process, supervisor: Supervisor) -> float:
+    """Of one core."""
+    refuse_dead(supervisor, WARM_UP_S)
+    before, start_s = sum(console.cpu_times()[:2]), time.perf_counter()
+    refuse_dead(supervisor, 2 * WINDOW_S)
+    return float(sum(console.cpu_times()[:2]) - before) / (time.perf_counter() - start_s)
+
+
+@contextmanager
+def flood(node: Any) -> Iterator[None]:
+    """FLOOD_HZ effects on the first robot, of one step after the other."""
+    events = node.create_publisher(FaultEvent, "coach/events", 1000)
+    stop, step = threading.Event(), itertools.count()
+
+    def send() -> None:
+        while not stop.wait(BURST_S):
+            for _ in range(round(FLOOD_HZ * BURST_S)):
+                event = FaultEvent(kind=FaultEvent.EFFECT, robot="robot_1", mode="random")
+                event.step = next(step)
+                events.publish(event)
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    yield
+    stop.set()
+    sender.join()
+    node.destroy_publisher(events)
+
+
+def flood_row(folder: Path) -> Row:
+    """The console's share of one core while the gate tells FLOOD_HZ effects, and while none."""
+    with ExitStack() as stack:
+        domain, client, supervisor, dt_s = running(
+            stack, folder, "buttons", mode="realtime", sim={"real_time_factor": HZ}
+        )
+        sample(client, dt_s)
+        with open_page(domain) as console:
+            calm = share_of(console, supervisor)
+            with flood(client.node):
+                flooded = share_of(console, supervisor)
+    return {
+        "name": f"console CPU, {FLOOD_HZ:,.0f} EFFECT events/s at most, against none, a page open",
+        "value": round(100 * flooded, 1),
+        "unit": "% of a core",
+        "reference": round(100 * calm, 1),
+        "ratio": None,
+        "target": None,
+        "ok": True,
+    }
+
+
 def share_row(folder: Path) -> Row:
     """Real time, MANY robots at HZ: the console's share of one core."""
     with ExitStack() as stack:
@@ -154,11 +208,7 @@ def share_row(folder: Path) -> Row:
         )
         sample(client, dt_s)
         with open_page(domain) as console:
-            refuse_dead(supervisor, WARM_UP_S)
-            before, start_s = sum(console.cpu_times()[:2]), time.perf_counter()
-            refuse_dead(supervisor, 2 * WINDOW_S)
-            used_s = sum(console.cpu_times()[:2]) - before
-            share = used_s / (time.perf_counter() - start_s)
+            share = share_of(console, supervisor)
     return {
         "name": f"console CPU, {MANY} robots at {HZ:g} Hz in real time, a page open",
         "value": round(100 * share, 1),
@@ -230,5 +280,5 @@ def rows() -> list[Row]:
     """All rows: {name, value, unit, reference, ratio, target, ok}."""
     with tempfile.TemporaryDirectory(prefix="crash_coach_bench_") as text:
         folder = Path(text)
-        made = [cost_row(folder), share_row(folder)]
+        made = [cost_row(folder), share_row(folder), flood_row(folder)]
         return made if chromium() is None else [*made, frames_row(folder)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -59,7 +60,13 @@ def console(
         sources = [shown(i, name, scenario, seed) for i, name in enumerate(what)]
     else:
         sources = graphs(domain or [None], namespace, end_faults)
-    serve(sources, access, port, lambda url: typer.echo(f"console: {url}"))
+    serve(sources, access, port, tell_address)
+
+
+def tell_address(url: str) -> None:
+    # Whoever closed the pipe wants no line, but the page can be wanted all the same.
+    with suppress(BrokenPipeError):
+        typer.echo(f"console: {url}")
 
 
 def graphs(domains: Sequence[int | None], namespace: str, end_faults: bool) -> list[Source]:

@@ -33,5 +33,7 @@ def logs_at(folder: Path) -> Iterator[None]:
     """Raises CliError where the body could not write its logs."""
     try:
         yield
+    except BrokenPipeError:  # of what is printed, by whoever read it
+        raise
     except OSError as error:
         raise CliError(not_written("--logs", folder, error)) from None
