@@ -135,7 +135,8 @@ def run(command: list[str], env: dict[str, str], place: str, ends_s: float | Non
             process.communicate(timeout=30)
     said = (out or b"") + err
     assert b"Traceback" not in said, said.decode(errors="replace")
-    text, told = said.decode(errors="replace"), err.decode(errors="replace").strip().splitlines()
+    text = said.decode(errors="replace")
+    told = [line for line in err.decode(errors="replace").splitlines() if line[:6] != "[INFO]"]
     code = process.returncode
     if code in (0, -signal.SIGPIPE, 128 + signal.SIGPIPE):
         return text

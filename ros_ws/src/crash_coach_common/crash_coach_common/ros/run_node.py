@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -36,7 +37,8 @@ def run(body: Callable[[list[int]], None], program: str | None = None) -> int:
         body: gets a list that SIGINT and SIGTERM are added to; it is to look at it often.
         program: what errors begin with; None: the executable's name.
 
-    Returns the exit code: 1 after one line of error on stderr, otherwise 0.
+    Returns the exit code: 1 after one line of error on stderr, or where nobody reads what is
+    printed any more; otherwise 0.
     """
     settle_caches(Path(__file__).parent)
     received: list[int] = []
@@ -51,6 +53,10 @@ def run(body: Callable[[list[int]], None], program: str | None = None) -> int:
         body(received)
     except (UserError, ParameterException, RCLError) as error:
         print(f"{program or Path(sys.argv[0]).name}: error: {error}", file=sys.stderr)  # noqa: T201
+        return 1
+    except BrokenPipeError:
+        # Whoever read what is printed is gone; nor must Python fail on it once more at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     finally:
         rclpy.try_shutdown()
