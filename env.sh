@@ -22,9 +22,9 @@ else
 fi
 . "$_cc_root/ros_ws/install/local_setup.bash"
 # One thread per process: a second run is a better use of a second core.
-# The same BLAS kernels on every machine with AVX2: a seed then trains the same team on all of them.
-if [ -z "${OPENBLAS_CORETYPE:-}" ] && grep -qw avx2 /proc/cpuinfo; then
-    export OPENBLAS_CORETYPE=Haswell
+# The same kernels of OpenBLAS and torch on every machine with AVX2: a seed then trains the same team on all of them.
+if grep -qw avx2 /proc/cpuinfo; then
+    export OPENBLAS_CORETYPE="${OPENBLAS_CORETYPE:-Haswell}" ATEN_CPU_CAPABILITY="${ATEN_CPU_CAPABILITY:-avx2}"
 fi
 export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE
 export ROS_AUTOMATIC_DISCOVERY_RANGE="${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}"

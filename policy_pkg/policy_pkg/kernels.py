@@ -1,8 +1,8 @@
 """Which compiled kernels do the arithmetic, and that they are the same on every machine.
 
-OpenBLAS picks its kernels by the processor, and kernels differ in the order in which they sum. A
-seed trains the same team on every x86-64 machine only where all use the same ones: those of the
-Haswell family, which every machine with AVX2 runs.
+OpenBLAS and torch pick their kernels by the processor, and kernels differ in the order in which
+they sum. A seed trains the same team on every x86-64 machine only where all use the same ones:
+OpenBLAS' for the Haswell family and torch's for AVX2, which every machine with AVX2 runs.
 """
 
 from __future__ import annotations
@@ -11,17 +11,21 @@ import os
 import sys
 from pathlib import Path
 
-CORETYPE = "OPENBLAS_CORETYPE"
-SAME_EVERYWHERE = "Haswell"
+# by the library that reads it: the variable, and what every machine with AVX2 runs
+SAME_EVERYWHERE = {
+    "numpy": ("OPENBLAS_CORETYPE", "Haswell"),
+    "torch": ("ATEN_CPU_CAPABILITY", "avx2"),
+}
 
 
 def pin_kernels() -> None:
-    """Has OpenBLAS use Haswell's kernels; call before numpy is loaded.
+    """Has OpenBLAS and torch use kernels for AVX2; call before numpy and torch are loaded.
 
-    Does nothing where the variable is set already, and on a processor without AVX2.
+    Leaves alone what is set already, and everything on a processor without AVX2.
     """
-    if CORETYPE not in os.environ and "numpy" not in sys.modules and _has_avx2():
-        os.environ[CORETYPE] = SAME_EVERYWHERE
+    for library, (variable, kernels) in SAME_EVERYWHERE.items():
+        if variable not in os.environ and library not in sys.modules and _has_avx2():
+            os.environ[variable] = kernels
 
 
 def _has_avx2() -> bool:

@@ -22,14 +22,14 @@ from policy_pkg.checkpoint import (
     write_checkpoint,
 )
 from policy_pkg.episode import Sizes
-from policy_pkg.learner import agent_net
+from policy_pkg.policy import weight_shapes
 
 SIZES = Sizes(n_robots=2, n_actions=5, obs_size=3, state_size=4, episode_limit=9)
 
 
 def weights(seed: int = 0) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(seed)
-    shapes, _ = agent_net.shapes(SIZES, hidden=8)
+    shapes = weight_shapes(SIZES.input_size, 8, SIZES.n_actions)
     return {name: rng.standard_normal(shape).astype(np.float32) for name, shape in shapes.items()}
 
 

@@ -11,19 +11,18 @@ import torch
 
 from policy_pkg.act import Explorer, greedy
 from policy_pkg.episode import Episode, Sizes
-from policy_pkg.learner import agent_net
+from policy_pkg.learner.agent_net import AgentNet
 from policy_pkg.learner.config import LearnerConfig
 from policy_pkg.learner.learner import Learner
-from policy_pkg.learner.packed_gru import Schedule
 from policy_pkg.learner.replay import Replay
-from policy_pkg.policy import RecurrentPolicy
+from policy_pkg.policy import RecurrentPolicy, weight_shapes
 
 SIZES = Sizes(n_robots=3, n_actions=6, obs_size=7, state_size=4, episode_limit=9)
 
 
 def random_weights(sizes: Sizes, hidden: int = 64, seed: int = 0) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(seed)
-    shapes, _ = agent_net.shapes(sizes, hidden)
+    shapes = weight_shapes(sizes.input_size, hidden, sizes.n_actions)
     return {
         name: (0.3 * rng.standard_normal(shape)).astype(np.float32)
         for name, shape in shapes.items()
@@ -57,8 +56,11 @@ def test_agrees_with_the_learners_agent_net_along_whole_episodes() -> None:
     weights = Learner(LearnerConfig(), SIZES, seed=2).agent_weights()
     n = SIZES.n_robots
     packed_rows = batch.inputs.reshape(-1, SIZES.input_size)
-    schedule = Schedule([int(rows) * n for rows in batch.alive])
-    learner_q = agent_net.values(weights, packed_rows, schedule)
+    net = AgentNet(SIZES, 64)
+    net.load_state_dict({name: torch.from_numpy(array) for name, array in weights.items()})
+    with torch.no_grad():
+        counts = torch.from_numpy(batch.alive * n).int()
+        learner_q = net(torch.from_numpy(packed_rows), counts).numpy()
     packed = learner_q.reshape(-1, n, SIZES.n_actions)
 
     policy = RecurrentPolicy(weights, n, SIZES.n_actions)

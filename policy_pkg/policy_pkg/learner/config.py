@@ -2,9 +2,20 @@
 
 from __future__ import annotations
 
+from importlib.metadata import entry_points
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+MIXER_GROUP = "crash_coach.mixers"
+ALGORITHMS = ("qmix", "vdn", "iql")
+
+
+def algorithm_names() -> tuple[str, ...]:
+    """Ours, then the mixers of other packages."""
+    return tuple(
+        dict.fromkeys((*ALGORITHMS, *(point.name for point in entry_points(group=MIXER_GROUP))))
+    )
 
 
 class LearnerConfig(BaseModel):
@@ -12,9 +23,13 @@ class LearnerConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    algorithm: Literal["qmix", "vdn", "iql"] = Field(
+    algorithm: str = Field(
         default="qmix",
-        description="qmix: monotonic mixer; vdn: sum; iql: team reward to each robot",
+        description="qmix: monotonic mixer; vdn: sum; iql: team reward to each robot; or the name "
+        "of another package's mixer",
+    )
+    device: Literal["cpu", "cuda"] = Field(
+        default="cpu", description="where the gradient steps are computed; acting stays on the CPU"
     )
     hidden: int = Field(
         default=64, ge=1, le=4096, description="units of the agent net's layers and GRU"
@@ -75,11 +90,20 @@ class LearnerConfig(BaseModel):
         "they executed was not the policy's choice",
     )
 
+    @field_validator("algorithm")
+    @classmethod
+    def _known(cls, algorithm: str) -> str:
+        if algorithm not in ALGORITHMS and algorithm not in algorithm_names():
+            raise ValueError(
+                f"unknown algorithm {algorithm!r}; one of: {', '.join(algorithm_names())}"
+            )
+        return algorithm
+
     @model_validator(mode="after")
     def _drop_needs_iql(self) -> Self:
         if self.crashed_loss == "drop" and self.algorithm != "iql":
             raise ValueError(
                 f"crashed_loss=drop needs algorithm=iql, not {self.algorithm}: "
-                "qmix and vdn have one loss for the whole team"
+                "with a mixer the whole team has one loss"
             )
         return self

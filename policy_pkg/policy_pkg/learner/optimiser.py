@@ -1,4 +1,4 @@
-"""The optimiser's step on a flat parameter vector, with its gradient's norm clipped."""
+"""One gradient step of nets: the loss' gradient, its norm clipped, torch's optimiser."""
 
 from __future__ import annotations
 
@@ -8,40 +8,65 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import Tensor
 
 from policy_pkg.learner.config import LearnerConfig
-from policy_pkg.learner.flat_parameters import FlatParameters, part
+from policy_pkg.learner.nets import Nets
+from policy_pkg.learner.replay import Batch
 from policy_pkg.learner.torch_steps import Adam, RMSprop, Steps
 
 Array = npt.NDArray[Any]
 _PREFIX = "optimiser."
 
 
+class DivergedError(RuntimeError):
+    """Loss or gradient is not finite. ``batch`` is a copy; the parameters are as before it."""
+
+    def __init__(self, batch: Batch, loss: float, grad_norm: float, updates: int) -> None:
+        super().__init__(
+            f"update {updates + 1} diverged: loss {loss}, gradient norm {grad_norm}; "
+            "the parameters were not changed"
+        )
+        self.batch = batch
+
+
 class Optimiser:
-    """torch's RMSprop or Adam over ``parameters``, whose memory it shares."""
+    """torch's RMSprop or Adam over the nets' flat vector."""
 
-    def __init__(self, config: LearnerConfig, parameters: FlatParameters) -> None:
-        self._config, self._parameters = config, parameters
-        self._flat = torch.from_numpy(parameters.flat).requires_grad_()
-        self._flat.grad = torch.from_numpy(parameters.gradient)
+    def __init__(self, config: LearnerConfig, nets: Nets) -> None:
+        self._config, self._nets = config, nets
+        self._flat = nets.flat.requires_grad_()
+        self._flat.grad = nets.gradient
         self._optimiser = _make(config, self._flat)
+        self.updates = 0
 
-    def gradient_norm(self) -> float:
-        """Of all parameters' gradient together; inf or NaN where it is not finite."""
-        gradient = self._parameters.gradient
-        with np.errstate(invalid="ignore", over="ignore"):
-            return math.sqrt(float(gradient @ gradient))
+    def gradient(self, loss: Tensor) -> float:
+        """Fills the nets' gradient; returns the loss."""
+        self._nets.gradient.zero_()
+        with np.errstate(invalid="ignore", over="ignore"):  # told by ``step``
+            torch.autograd.backward(loss)
+        return loss.item()
 
-    def step(self, norm: float) -> None:
-        """Scales the gradient of this ``norm`` down to the bound, and takes one step."""
-        if norm > self._config.grad_norm_clip:
-            self._parameters.gradient *= self._config.grad_norm_clip / (norm + 1e-6)
+    def step(self, loss: Tensor, batch: Batch) -> dict[str, float]:
+        """Takes one step against the gradient; returns ``loss`` and ``grad_norm`` before clipping.
+
+        Raises:
+            DivergedError: loss or gradient is not finite.
+        """
+        value, clip = self.gradient(loss), self._config.grad_norm_clip
+        norm = torch.linalg.vector_norm(self._nets.gradient).item()
+        if not (math.isfinite(value) and math.isfinite(norm)):
+            raise DivergedError(batch.copy(), value, norm, self.updates)
+        if norm > clip:
+            self._nets.gradient.mul_(clip / (norm + 1e-6))
         self._optimiser.step()
+        self.updates += 1
+        return {"loss": value, "grad_norm": norm}
 
     def state_dict(self) -> dict[str, Array]:
         """Copies, by name; nothing before the first step."""
         state = self._optimiser.state
-        return {_PREFIX + name: tensor.numpy().copy() for name, tensor in state.items()}
+        return {_PREFIX + name: tensor.cpu().numpy().copy() for name, tensor in state.items()}
 
     def load_state_dict(self, arrays: dict[str, Array], updates: int) -> None:
         """Puts back what ``state_dict`` gave after ``updates`` steps; ignores other arrays.
@@ -49,7 +74,8 @@ class Optimiser:
         Raises:
             ValueError: it belongs to another optimiser or other parameters.
         """
-        moments, size = part(arrays, _PREFIX), self._parameters.flat.size
+        moments = {k.removeprefix(_PREFIX): v for k, v in arrays.items() if k.startswith(_PREFIX)}
+        size = self._flat.numel()
         expected = {} if updates == 0 else _moments(self._config, size)
         if {name: array.shape for name, array in moments.items()} != expected:
             raise ValueError(
@@ -57,8 +83,11 @@ class Optimiser:
                 f"{self._config.optimiser} over {size} parameters"
             )
         self._optimiser.state = {
-            name: torch.from_numpy(array.copy()) for name, array in moments.items()
+            # the count of steps stays on the CPU, as torch has it
+            name: torch.from_numpy(array.copy()).to("cpu" if array.ndim == 0 else self._flat.device)
+            for name, array in moments.items()
         }
+        self.updates = updates
 
 
 def check_arrays(nets: dict[str, Array], arrays: dict[str, Array]) -> None:
@@ -76,5 +105,5 @@ def _moments(config: LearnerConfig, parameters: int) -> dict[str, tuple[int, ...
     return {"step": (), **dict.fromkeys(names, (parameters,))}
 
 
-def _make(config: LearnerConfig, flat: torch.Tensor) -> Steps:
+def _make(config: LearnerConfig, flat: Tensor) -> Steps:
     return (Adam if config.optimiser == "adam" else RMSprop)(config, flat)

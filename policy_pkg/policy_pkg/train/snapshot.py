@@ -36,7 +36,8 @@ class Team:
 class Learns(Protocol):
     """What is left of a learner once it has learned."""
 
-    updates: int
+    @property
+    def updates(self) -> int: ...
 
     def agent_weights(self) -> Mapping[str, Any]: ...
 

@@ -122,7 +122,7 @@ def test_a_saved_cloner_goes_on_bit_for_bit(optimiser: Any) -> None:
 def test_states_that_do_not_fit_are_named() -> None:
     cloner = Cloner(LearnerConfig(hidden=8), SIZES, seed=1)
     arrays, scalars = cloner.state_dict()
-    with pytest.raises(ValueError, match="has algorithm qmix, this one behaviour_cloning"):
+    with pytest.raises(ValueError, match="has algorithm qmix, this learner behaviour_cloning"):
         cloner.load_state_dict(arrays, {**scalars, "algorithm": "qmix"})
     with pytest.raises(ValueError, match=r"fc1\.weight: float32 \(8, 12\); must be"):
         Cloner(LearnerConfig(hidden=9), SIZES, seed=1).load_state_dict(arrays, scalars)

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from policy_pkg.episode import Episode, Sizes
 from policy_pkg.learner.config import LearnerConfig
-from policy_pkg.learner.cross_entropy import cross_entropy, robot_step_weights
 from policy_pkg.learner.learner import Learner
+from policy_pkg.learner.loss import Steps, cross_entropy
 from policy_pkg.learner.replay import Batch, Replay
 
 SMALL: dict[str, Any] = {"hidden": 8, "mixing_hidden": 4, "hypernet_hidden": 6}
@@ -59,26 +59,34 @@ def _one_step() -> Batch:
     return _batch([episode], sizes)
 
 
+def _cross_entropy(q: np.ndarray, keep_crashed: bool) -> tuple[float, np.ndarray]:
+    """The term, and its gradient, of (rows, A) values of ``_one_step``."""
+    values = torch.from_numpy(q).view(2, 2, 3).requires_grad_()
+    steps = Steps.of(_one_step(), None, values.dtype, "cpu")
+    term = cross_entropy(values, steps, keep_crashed)
+    term.backward()
+    assert values.grad is not None
+    return term.item(), values.grad.view(4, 3).numpy()
+
+
 def test_by_hand() -> None:
     """log(e^1 + e^2) - 1 = log(1 + e); its gradient is softmax(1, 2) minus the one-hot of 0."""
-    batch, q = _one_step(), np.array([[1.0, 2.0, 50.0], [3.0, 3.0, 0.0], [9.0] * 3, [9.0] * 3])
-    grad = np.zeros_like(q)
-    term = cross_entropy(q, batch, robot_step_weights(batch, False, None), 2.0, grad)
+    q = np.array([[1.0, 2.0, 50.0], [3.0, 3.0, 0.0], [9.0] * 3, [9.0] * 3])
+    term, grad = _cross_entropy(q, keep_crashed=False)
     assert term == pytest.approx(np.log(1 + np.e))
     share = 1 / (1 + np.e)  # softmax of the lower value
-    expected = 2.0 * np.array([[share - 1, 1 - share, 0.0]])
+    expected = np.array([[share - 1, 1 - share, 0.0]])
     np.testing.assert_allclose(grad, np.concatenate((expected, np.zeros((3, 3)))))
 
-    grad[:] = 0
-    kept = cross_entropy(q, batch, robot_step_weights(batch, True, None), 1.0, grad)
+    kept, grad = _cross_entropy(q, keep_crashed=True)
     assert kept == pytest.approx((np.log(1 + np.e) + np.log(2)) / 2)
     np.testing.assert_allclose(grad[1], [0.25, -0.25, 0.0])
 
 
 def test_large_values_do_not_overflow() -> None:
-    batch, grad = _one_step(), np.zeros((4, 3), np.float32)
     q = np.array([[1e5, -1e5, 1e9], [0.0] * 3, [0.0] * 3, [0.0] * 3], np.float32)
-    assert cross_entropy(q, batch, robot_step_weights(batch, False, None), 1.0, grad) == 0.0
+    term, grad = _cross_entropy(q, keep_crashed=False)
+    assert term == 0.0
     assert np.isfinite(grad).all()
 
 

@@ -37,7 +37,7 @@ def _episode(first: tuple[int, int], second: tuple[int, int]) -> Episode:
     )
 
 
-def _trained(algorithm: str) -> Learner:
+def trained(algorithm: str) -> Learner:
     """Learns from uniform exploration: every joint action sequence equally often."""
     replay = Replay(32, SIZES)
     for a, b, c, d in [*itertools.product((0, 1), repeat=4)] * 2:
@@ -60,8 +60,8 @@ def _trained(algorithm: str) -> Learner:
     return learner
 
 
-def _greedy_return(learner: Learner) -> tuple[float, float]:
-    """(return, Q_tot at the start) of the greedy joint policy."""
+def greedy_episode(learner: Learner) -> Episode:
+    """What the greedy joint policy does."""
     policy = RecurrentPolicy(learner.agent_weights(), 2, 2)
     hidden, last = policy.initial_hidden(2), np.full(2, -1, np.int32)
     robots, everything = np.arange(2, dtype=np.int32), np.ones((2, 2), np.bool_)
@@ -72,21 +72,26 @@ def _greedy_return(learner: Learner) -> tuple[float, float]:
         last = greedy(q, everything)
         chosen.append((int(last[0]), int(last[1])))
         state = 1 + chosen[0][0]
-    episode = _episode(chosen[0], chosen[1])
+    return _episode(chosen[0], chosen[1])
+
+
+def _greedy_return(learner: Learner) -> tuple[float, float]:
+    """(return, Q_tot at the start) of the greedy joint policy."""
+    episode = greedy_episode(learner)
     params = params_of(learner.state_dict()[0], "online", False)
     q_start = values(params, episode)[0]
-    taken = [q_start[robot][chosen[0][robot]] for robot in range(2)]
+    taken = [q_start[robot][int(episode.actions[0, robot])] for robot in range(2)]
     total = mix(learner.config.algorithm, params, taken, episode.state[0])
     return float(episode.reward.sum()), float(total)
 
 
 def test_qmix_learns_the_value_8() -> None:
-    payoff, value = _greedy_return(_trained("qmix"))
+    payoff, value = _greedy_return(trained("qmix"))
     assert payoff == 8.0
     assert abs(value - 8.0) < 0.1
 
 
 def test_vdn_settles_at_7() -> None:
-    payoff, value = _greedy_return(_trained("vdn"))
+    payoff, value = _greedy_return(trained("vdn"))
     assert payoff == 7.0
     assert abs(value - 7.0) < 0.1

@@ -15,7 +15,7 @@ from small_run import small
 
 from policy_pkg.checkpoint import find_checkpoint
 from policy_pkg.kernels import kernels
-from policy_pkg.learner.native import NUMPY, VARIABLE, build_name
+from policy_pkg.learner.native import TORCH, VARIABLE, build_name
 
 NO_AVX512 = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
 TRAIN = """
@@ -46,7 +46,7 @@ for size in (1, 2, 7, 8, 9, 16, 24, 33, 100):
 
 def machine(**variables: str) -> dict[str, str]:
     """An environment in which libraries take this machine for another one."""
-    pinned = ("OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES", "ATEN_CPU_CAPABILITY")
+    pinned = ("OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES", "ATEN_CPU_CAPABILITY", "MKL_CBWR")
     kept = {key: value for key, value in os.environ.items() if key not in pinned}
     return {**kept, **variables}
 
@@ -76,11 +76,12 @@ def test_training_has_the_same_bits_on_other_processors(tmp_path: Path, numba: b
     target = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CACHE_DIR": str(tmp_path / "numba")}
     config = small(explore_hold=6, replay_strata="outcome", learner={"td_lambda": 0.8}, n_envs=8)
     machines = {
-        "this": machine(**{VARIABLE: build_name() or NUMPY}),
+        "this": machine(**{VARIABLE: build_name() or TORCH}),
         "older": machine(
             **{VARIABLE: "avx2"},
             NPY_DISABLE_CPU_FEATURES=disabled(),
             ATEN_CPU_CAPABILITY="avx2",
+            MKL_CBWR="COMPATIBLE",  # other kernels than this machine's: nothing may go through MKL
             **(target if numba else {}),
         ),
     }

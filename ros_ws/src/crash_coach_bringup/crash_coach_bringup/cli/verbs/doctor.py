@@ -55,16 +55,16 @@ def threads() -> Finding:
 
 
 def blas_kernels() -> Finding:
-    found = kernels()["openblas"]
+    found, (variable, wanted) = kernels()["openblas"], SAME_EVERYWHERE["numpy"]
     hint = (
         ""
-        if found == SAME_EVERYWHERE
+        if found == wanted
         else (
-            f"runs are the same on every machine with OPENBLAS_CORETYPE={SAME_EVERYWHERE}: source "
-            "env.sh (needs AVX2)"
+            f"runs are the same on every machine with {variable}={wanted}: source env.sh "
+            "(needs AVX2)"
         )
     )
-    return Finding("BLAS kernels", found == SAME_EVERYWHERE, found or "not OpenBLAS", hint)
+    return Finding("BLAS kernels", found == wanted, found or "not OpenBLAS", hint)
 
 
 def caches() -> Finding:
