@@ -25,7 +25,7 @@ VENV = ROOT / ".venv"
 PYTHON = VENV / "bin" / "python"
 STAMPS = VENV / ".crash_coach"
 WORKSPACE = ROOT / "ros_ws"
-KERNEL = ROOT / "policy_pkg/policy_pkg/learner/native/unroll.cpp"
+KERNELS = ROOT / "policy_pkg/policy_pkg/learner/native"
 # Both give the same bits (the source says why): the learner takes the best its processor can run.
 KERNEL_FLAGS = {"avx2": ["-mavx2", "-mfma"], "avx512": ["-mavx512f", "-mavx2", "-mfma"]}
 KERNEL_OPTIONS = ["-std=c++17", "-O3", "-ffp-contract=off", "-fPIC", "-shared"]
@@ -195,16 +195,17 @@ def rewrite_cmake_paths() -> int:
     return changed
 
 
-def build_kernel() -> None:
-    """The learner's kernel, for processors with and without AVX-512."""
+def build_kernels() -> None:
+    """The learner's kernels, for processors with and without AVX-512."""
     folder = VENV / "lib" / "crash_coach"
     folder.mkdir(parents=True, exist_ok=True)
     for name, flags in KERNEL_FLAGS.items():
         # A new file: a training that runs has the old one open.
-        fresh = folder / f"unroll_{name}.partial"
-        command = ["c++", *KERNEL_OPTIONS, *flags, str(KERNEL), "-o", str(fresh)]
+        fresh = folder / f"learner_{name}.partial"
+        sources = map(str, sorted(KERNELS.glob("*.cpp")))
+        command = ["c++", *KERNEL_OPTIONS, *flags, *sources, "-o", str(fresh)]
         run(command, VENV / "log" / "kernel.log")
-        os.replace(fresh, folder / f"unroll_{name}.so")
+        os.replace(fresh, folder / f"learner_{name}.so")
 
 
 def workspace_sources() -> list[str | Path]:
@@ -254,10 +255,10 @@ def main() -> int:
             stage("venv", "virtual environment", base, lambda: make_venv(python))
             packages = fingerprint([base, LOCK])
             stage("packages", "packages (torch is large)", packages, lambda: install_packages(ros))
-            if platform.machine() == "x86_64":  # elsewhere numpy does the same, slower
-                options = [*KERNEL_OPTIONS, str(KERNEL_FLAGS)]
-                kernel = fingerprint([base, KERNEL, *options])
-                stage("kernel", "learner's kernel", kernel, build_kernel)
+            if platform.machine() == "x86_64":  # elsewhere torch does the same, slower
+                sources = [path for path in sorted(KERNELS.iterdir()) if path.suffix in (".h", ".cpp")]
+                kernels = fingerprint([base, *sources, *KERNEL_OPTIONS, str(KERNEL_FLAGS)])
+                stage("kernel", "learner's kernels", kernels, build_kernels)
             build = fingerprint([packages, *workspace_sources()])
             stage("workspace", "ROS workspace", build, lambda: build_workspace(ros))
     except SetupError as error:

@@ -21,6 +21,7 @@ that keeps actions which the data lack from being overvalued (CQL, Kumar et al. 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -48,7 +49,7 @@ class Steps:
     reward: Tensor  # (M,)
     bootstrap: Tensor  # (M,) 0 where the step terminated its episode, else 1
     available: Tensor  # (N, n, A)
-    faulted: Tensor  # (M, n)
+    faults: Tensor  # (M, n) codes of the faults in force, 0: none
     weight: Tensor | None  # (M,) factor of each step's episode; None: 1
     alive: list[int]  # episodes that have an observation at t
 
@@ -70,10 +71,15 @@ class Steps:
             reward=tensor(batch.reward, dtype),
             bootstrap=tensor(batch.bootstrap, dtype),
             available=tensor(batch.available),
-            faulted=tensor(batch.faults) != 0,
+            faults=tensor(batch.faults),
             weight=None if weights is None else tensor(weights[batch.episode], dtype),
             alive=batch.alive.tolist(),
         )
+
+    @property
+    def faulted(self) -> Tensor:
+        """(M, n)"""
+        return self.faults != 0
 
     def values(self, nets: Nets) -> Tensor:
         """(N, n, A) action values of the observation rows."""
@@ -81,7 +87,7 @@ class Steps:
 
     def at_taken(self, values: Tensor) -> Tensor:
         """(M, n) of (N, n, A) values those of the taken actions."""
-        return values.reshape(-1).gather(0, self.taken).view(self.faulted.shape)
+        return values.reshape(-1).gather(0, self.taken).view(self.faults.shape)
 
     def after(self, rows: Tensor) -> Tensor:
         """Of (N, ...) what belongs to each step's end, (M, ...)."""
@@ -97,7 +103,7 @@ def loss(
     """
     q = steps.values(online)
     q_taken = steps.at_taken(q)
-    total = online.mix(q_taken, steps.state[steps.now])
+    total = online.mix(q_taken, steps.state.index_select(0, steps.now))
 
     with torch.no_grad():
         q_target = steps.after(steps.values(target))
@@ -157,16 +163,16 @@ def lambda_returns(steps: Steps, following: Tensor, gamma: float, td_lambda: flo
     if td_lambda == 0:
         return reward + discount * following
     counts = steps.alive[1:]
-    reward = reward.expand_as(following)
-    parts = [x.split_with_sizes(counts) for x in (reward, discount, following)]
-    returns: list[Tensor] = []
-    for r, d, value in reversed(list(zip(*parts, strict=True))):
-        if returns:
-            later = returns[-1]
-            value = value.clone()
-            value[: len(later)].lerp_(later, td_lambda)
-        returns.append(torch.addcmul(r, d, value))
-    return torch.cat(returns[::-1])
+    parts = [size for now, later in pairwise([*counts, 0]) for size in (later, now - later)]
+    goes_on = torch.tensor([1.0, 0.0] * len(counts), dtype=following.dtype)
+    goes_on = goes_on.repeat_interleave(torch.tensor(parts)).to(following.device)
+    weight = td_lambda * _per_step(goes_on, following)  # of y_t+1; 0 at the last t
+    returns = reward + discount * (1 - weight) * following
+    here, later = returns.split_with_sizes(parts)[::2], returns.split_with_sizes(counts)[1:]
+    share = (discount * weight).split_with_sizes(parts)[::2]
+    for t in range(len(later) - 1, -1, -1):
+        here[t].addcmul_(share[t], later[t])
+    return returns
 
 
 def cross_entropy(q: Tensor, steps: Steps, keep_crashed: bool) -> Tensor:

@@ -19,6 +19,8 @@ from crash_coach_common.plugins import Plugins
 from policy_pkg.episode import Sizes
 from policy_pkg.learner.config import MIXER_GROUP, LearnerConfig
 from policy_pkg.learner.layers import Linear
+from policy_pkg.learner.native.kernel import library
+from policy_pkg.learner.native.qmix import qmix
 
 
 class Vdn(nn.Module):
@@ -45,6 +47,12 @@ class Qmix(nn.Module):
         self.v = Linear(mixing, 1)
 
     def forward(self, values: Tensor, state: Tensor) -> Tensor:
+        """On the CPU in float32 a compiled kernel does it; what it does stands here, and is done on a
+        GPU and in float64. It takes a quarter of the time of torch's two dozen operations."""
+        kernels = library(values, state)
+        if kernels is not None:
+            layers = (self.state, self.w1, self.w2, self.v)
+            return qmix(kernels, values, state, [p for x in layers for p in (x.weight, x.bias)])
         for_w1, for_w2, for_v, b1 = self.state(state).split(self.parts, 1)
         w1 = self.w1(torch.relu(for_w1)).abs().view(*values.shape, -1)
         w2 = self.w2(torch.relu(for_w2)).abs()

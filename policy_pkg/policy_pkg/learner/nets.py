@@ -35,6 +35,7 @@ class Nets(nn.Module):
         self.mixing = mixing
         self.mixer = make_mixer(config, sizes) if mixing else None
         self.flat = self.gradient = torch.empty(0)
+        self._views: list[nn.Parameter] = []  # into ``flat``, in its order
 
     def flatten(self, like: Nets | None = None, **place: Any) -> None:
         """Lays the parameters out in one vector; with the values of ``like``, frozen, or their own.
@@ -42,20 +43,20 @@ class Nets(nn.Module):
         place: dtype and device.
         """
         self.to(**place)
-        parameters = list(self.parameters())
-        self.flat = torch.cat([p.detach().reshape(-1) for p in parameters])
+        self._views = list(self.parameters())
+        self.flat = torch.cat([p.detach().reshape(-1) for p in self._views])
         if like is not None:
             self.flat.copy_(like.flat)
         self.gradient = torch.zeros_like(self.flat)
-        sizes = [p.numel() for p in parameters]
-        views = zip(
-            self.flat.split_with_sizes(sizes), self.gradient.split_with_sizes(sizes), strict=True
-        )
-        for parameter, (value, gradient) in zip(parameters, views, strict=True):
-            parameter.data = value.view(parameter.shape)
-            if like is None:
-                parameter.grad = gradient.view(parameter.shape)
+        parts = self.flat.split_with_sizes([p.numel() for p in self._views])
+        for parameter, part in zip(self._views, parts, strict=True):
+            parameter.data = part.view(parameter.shape)
         self.requires_grad_(like is None)
+
+    def differentiate(self, loss: Tensor) -> None:
+        """Fills ``gradient``."""
+        found = torch.autograd.grad(loss, self._views, materialize_grads=True)
+        torch.cat([grad.reshape(-1) for grad in found], out=self.gradient)
 
     def mix(self, values: Tensor, state: Tensor) -> Tensor:
         """(M, n) values of the robots -> (M,) of the team; without a mixer as they are."""
@@ -79,8 +80,9 @@ class Nets(nn.Module):
 
     def gradients(self) -> dict[str, Array]:
         """The parameters' gradients by name; on the CPU they are views."""
-        named = self.named()
-        return {name: p.grad.cpu().numpy() for name, p in named if p.grad is not None}
+        parts = self.gradient.split_with_sizes([p.numel() for p in self._views])
+        by_parameter = dict(zip(self._views, parts, strict=True))
+        return {k: by_parameter[p].view(p.shape).cpu().numpy() for k, p in self.named()}
 
     @torch.no_grad()
     def load_arrays(self, arrays: Mapping[str, Array]) -> None:

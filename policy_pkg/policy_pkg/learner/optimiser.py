@@ -42,9 +42,8 @@ class Optimiser:
 
     def gradient(self, loss: Tensor) -> float:
         """Fills the nets' gradient; returns the loss."""
-        self._nets.gradient.zero_()
         with np.errstate(invalid="ignore", over="ignore"):  # told by ``step``
-            torch.autograd.backward(loss)
+            self._nets.differentiate(loss)
         return loss.item()
 
     def step(self, loss: Tensor, batch: Batch) -> dict[str, float]:

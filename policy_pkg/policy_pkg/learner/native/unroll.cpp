@@ -1,204 +1,8 @@
 // The agent net, Linear - ReLU - GRU - Linear, over a packed batch: forward, and backward by hand.
-//
-// Every value is one chain of fused multiply-adds in ascending order of what is summed, whatever the
-// vector's width: vectors run over outputs, never over what is summed. So a build for AVX2 and one for
-// AVX-512 give the same bits, and a row has the same bits in every batch. Only sums over rows, the
-// gradients of weights, are cut into blocks of BLOCK rows, for accuracy; the blocks are the same in
-// both builds. Build with -ffp-contract=off: the compiler must not fuse what is not fused here.
-//
-// Layout: row-major; the columns of a padded array are a multiple of PAD, and the padding is zero.
 
-#include <immintrin.h>
-
-#include <cstddef>
-#include <cstring>
-#include <vector>
+#include "products.h"
 
 namespace {
-
-constexpr int PAD = 32;
-constexpr int BLOCK = 256;
-
-#ifdef __AVX512F__
-constexpr int LANES = 16, TILE = 8;
-using Vec = __m512;
-inline Vec load(const float* p) { return _mm512_loadu_ps(p); }
-inline void store(float* p, Vec v) { _mm512_storeu_ps(p, v); }
-inline Vec all(float x) { return _mm512_set1_ps(x); }
-inline Vec fma(Vec a, Vec b, Vec c) { return _mm512_fmadd_ps(a, b, c); }
-inline Vec add(Vec a, Vec b) { return _mm512_add_ps(a, b); }
-inline Vec sub(Vec a, Vec b) { return _mm512_sub_ps(a, b); }
-inline Vec mul(Vec a, Vec b) { return _mm512_mul_ps(a, b); }
-inline Vec quotient(Vec a, Vec b) { return _mm512_div_ps(a, b); }
-inline Vec larger(Vec a, Vec b) { return _mm512_max_ps(a, b); }
-inline Vec smaller(Vec a, Vec b) { return _mm512_min_ps(a, b); }
-inline Vec rounded(Vec a) { return _mm512_roundscale_ps(a, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
-inline Vec two_to(Vec n) {
-    const __m512i i = _mm512_add_epi32(_mm512_cvtps_epi32(n), _mm512_set1_epi32(127));
-    return _mm512_castsi512_ps(_mm512_slli_epi32(i, 23));
-}
-inline Vec where_positive(Vec x, Vec value) {
-    return _mm512_maskz_mov_ps(_mm512_cmp_ps_mask(x, _mm512_setzero_ps(), _CMP_GT_OQ), value);
-}
-#else
-constexpr int LANES = 8, TILE = 6;
-using Vec = __m256;
-inline Vec load(const float* p) { return _mm256_loadu_ps(p); }
-inline void store(float* p, Vec v) { _mm256_storeu_ps(p, v); }
-inline Vec all(float x) { return _mm256_set1_ps(x); }
-inline Vec fma(Vec a, Vec b, Vec c) { return _mm256_fmadd_ps(a, b, c); }
-inline Vec add(Vec a, Vec b) { return _mm256_add_ps(a, b); }
-inline Vec sub(Vec a, Vec b) { return _mm256_sub_ps(a, b); }
-inline Vec mul(Vec a, Vec b) { return _mm256_mul_ps(a, b); }
-inline Vec quotient(Vec a, Vec b) { return _mm256_div_ps(a, b); }
-inline Vec larger(Vec a, Vec b) { return _mm256_max_ps(a, b); }
-inline Vec smaller(Vec a, Vec b) { return _mm256_min_ps(a, b); }
-inline Vec rounded(Vec a) { return _mm256_round_ps(a, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
-inline Vec two_to(Vec n) {
-    const __m256i i = _mm256_add_epi32(_mm256_cvtps_epi32(n), _mm256_set1_epi32(127));
-    return _mm256_castsi256_ps(_mm256_slli_epi32(i, 23));
-}
-inline Vec where_positive(Vec x, Vec value) {
-    return _mm256_and_ps(_mm256_cmp_ps(x, _mm256_setzero_ps(), _CMP_GT_OQ), value);
-}
-#endif
-
-constexpr int WIDE = 2 * LANES;  // columns of a tile
-
-// The maximum of two vectors is its second operand where one is not a number: data comes second, so
-// that a NaN is never lost.
-
-// e^x for x <= 0, by 2^n e^r with |r| <= ln(2) / 2 and the series of e^r to the seventh power.
-inline Vec exp_negative(Vec x) {
-    x = larger(all(-87.0f), x);
-    const Vec n = rounded(mul(x, all(1.44269504f)));
-    // ln 2 in two parts, the first with trailing zeros, so that n times it is exact
-    const Vec r = fma(n, all(-1.42860677e-6f), fma(n, all(-0.693145752f), x));
-    Vec p = all(1.0f / 5040);
-    p = fma(p, r, all(1.0f / 720));
-    p = fma(p, r, all(1.0f / 120));
-    p = fma(p, r, all(1.0f / 24));
-    p = fma(p, r, all(1.0f / 6));
-    p = fma(p, r, all(0.5f));
-    p = fma(p, r, all(1.0f));
-    p = fma(p, r, all(1.0f));
-    return mul(p, two_to(n));
-}
-
-inline Vec absolute(Vec x) { return larger(sub(all(0.0f), x), x); }
-
-inline Vec sigmoid(Vec x) {
-    const Vec e = exp_negative(sub(all(0.0f), absolute(x)));
-    const Vec small = quotient(e, add(all(1.0f), e));  // of -|x|
-    const Vec one_less = sub(all(1.0f), small);
-    return add(where_positive(x, sub(one_less, small)), small);  // x > 0: 1 - small
-}
-
-inline Vec tanh_of(Vec x) {
-    const Vec e = exp_negative(mul(all(-2.0f), absolute(x)));
-    const Vec t = quotient(sub(all(1.0f), e), add(all(1.0f), e));  // of |x|
-    return sub(where_positive(x, add(t, t)), t);
-}
-
-// C (ROWS x WIDE) = start + A B over k ascending; A's element (i, k) lies at a[i * row + k * step].
-template <int ROWS>
-inline void tile(int depth, const float* a, ptrdiff_t row, ptrdiff_t step, const float* b,
-                 ptrdiff_t ldb, const Vec (&start)[ROWS][2], Vec (&c)[ROWS][2]) {
-    for (int i = 0; i < ROWS; ++i) c[i][0] = start[i][0], c[i][1] = start[i][1];
-    for (int k = 0; k < depth; ++k) {
-        const Vec b0 = load(b + k * ldb), b1 = load(b + k * ldb + LANES);
-        for (int i = 0; i < ROWS; ++i) {
-            const Vec x = all(a[i * row + k * step]);
-            c[i][0] = fma(x, b0, c[i][0]);
-            c[i][1] = fma(x, b1, c[i][1]);
-        }
-    }
-}
-
-enum class Start { zero, bias, c };
-
-// What goes into C: nothing, a bias per column, or what is there; or the product is added to C last.
-template <int ROWS, bool ADD>
-inline void product_rows(Start start, int columns, int depth, const float* a, ptrdiff_t row,
-                         ptrdiff_t step, const float* b, ptrdiff_t panel, ptrdiff_t ldb,
-                         const float* bias, float* c, ptrdiff_t ldc) {
-    for (int j = 0; j < columns; j += WIDE) {
-        Vec begin[ROWS][2], out[ROWS][2];
-        for (int i = 0; i < ROWS; ++i)
-            for (int v = 0; v < 2; ++v) {
-                const int at = j + v * LANES;
-                begin[i][v] = start == Start::zero   ? all(0.0f)
-                              : start == Start::bias ? load(bias + at)
-                                                     : load(c + i * ldc + at);
-            }
-        tile<ROWS>(depth, a, row, step, b + (j / WIDE) * panel, ldb, begin, out);
-        for (int i = 0; i < ROWS; ++i)
-            for (int v = 0; v < 2; ++v) {
-                float* at = c + i * ldc + j + v * LANES;
-                store(at, ADD ? add(load(at), out[i][v]) : out[i][v]);
-            }
-    }
-}
-
-template <bool ADD, int ROWS = TILE>
-inline void product(Start start, int rows, int columns, int depth, const float* a, ptrdiff_t row,
-                    ptrdiff_t step, const float* b, ptrdiff_t panel, ptrdiff_t ldb,
-                    const float* bias, float* c, ptrdiff_t ldc) {
-    while (rows >= ROWS) {
-        product_rows<ROWS, ADD>(start, columns, depth, a, row, step, b, panel, ldb, bias, c, ldc);
-        a += ROWS * row, c += ROWS * ldc, rows -= ROWS;
-    }
-    if constexpr (ROWS > 1)
-        if (rows > 0)
-            product<ADD, ROWS / 2>(start, rows, columns, depth, a, row, step, b, panel, ldb, bias, c, ldc);
-}
-
-int padded(int n) { return (n + PAD - 1) / PAD * PAD; }
-
-// A weight as tiles want it: panels of WIDE columns, each (depth x WIDE) without gaps.
-struct Packed {
-    std::vector<float> data;
-    int depth, columns;
-    ptrdiff_t panel() const { return static_cast<ptrdiff_t>(depth) * WIDE; }
-};
-
-Packed packed(int depth, int columns) {
-    return {std::vector<float>(static_cast<size_t>(depth) * columns, 0.0f), depth, columns};
-}
-
-void put(Packed& to, int k, int column, float value) {
-    to.data[(column / WIDE) * to.panel() + static_cast<ptrdiff_t>(k) * WIDE + column % WIDE] = value;
-}
-
-// C = A B for a packed B; A is (rows x depth), row-major.
-void times(Start start, int rows, const float* a, ptrdiff_t lda, const Packed& b, const float* bias,
-           float* c, ptrdiff_t ldc) {
-    product<false>(start, rows, b.columns, b.depth, a, lda, 1, b.data.data(), b.panel(), WIDE, bias, c, ldc);
-}
-
-// C (m x n) = A' B summed over rows, in blocks; A is (rows x m), B (rows x n), n padded.
-void over_rows(int rows, const float* a, ptrdiff_t lda, int m, const float* b, ptrdiff_t ldb, int n,
-               float* c, ptrdiff_t ldc) {
-    for (int i = 0; i < m; ++i) std::memset(c + i * ldc, 0, sizeof(float) * n);
-    for (int from = 0; from < rows; from += BLOCK) {
-        const int count = rows - from < BLOCK ? rows - from : BLOCK;
-        product<true>(Start::zero, m, n, count, a + from * lda, 1, lda, b + from * ldb, WIDE, ldb,
-                      nullptr, c, ldc);
-    }
-}
-
-void column_sums(int rows, const float* a, ptrdiff_t lda, int n, float* out) {
-    for (int j = 0; j < n; j += LANES) {
-        Vec total = all(0.0f);
-        for (int from = 0; from < rows; from += BLOCK) {
-            const int end = rows < from + BLOCK ? rows : from + BLOCK;
-            Vec part = all(0.0f);
-            for (int i = from; i < end; ++i) part = add(part, load(a + i * lda + j));
-            total = add(total, part);
-        }
-        store(out + j, total);
-    }
-}
 
 // Gates in three blocks of H padded columns each, in the order r, z, n of the parameters.
 struct Net {
@@ -215,20 +19,18 @@ struct Net {
                     *fc2_w = p[6], *fc2_b = p[7];
         for (int j = 0; j < hidden; ++j) {
             bias1[j] = fc1_b[j], bias_hn[j] = b_hh[2 * hidden + j];
-            for (int k = 0; k < inputs; ++k) put(fc1, k, j, fc1_w[j * inputs + k]);
+            put_column(fc1, 0, j, fc1_w + static_cast<ptrdiff_t>(j) * inputs, inputs);
             for (int gate = 0; gate < 3; ++gate) {
                 const int from = gate * hidden + j, to = gate * h + j;
                 bias[to] = gate < 2 ? b_ih[from] + b_hh[from] : b_ih[from];
-                for (int k = 0; k < hidden; ++k) {
-                    put(w_ih, k, to, ih[from * hidden + k]);
-                    if (gate < 2) put(w_hh_rz, k, to, hh[from * hidden + k]);
-                    else put(w_hh_n, k, j, hh[from * hidden + k]);
-                }
+                put_column(w_ih, 0, to, ih + static_cast<ptrdiff_t>(from) * hidden, hidden);
+                put_column(gate < 2 ? w_hh_rz : w_hh_n, 0, gate < 2 ? to : j,
+                           hh + static_cast<ptrdiff_t>(from) * hidden, hidden);
             }
         }
         for (int j = 0; j < actions; ++j) {
             bias2[j] = fc2_b[j];
-            for (int k = 0; k < hidden; ++k) put(fc2, k, j, fc2_w[j * hidden + k]);
+            put_column(fc2, 0, j, fc2_w + static_cast<ptrdiff_t>(j) * hidden, hidden);
         }
     }
 };
@@ -241,7 +43,8 @@ struct Tape {
           hidden(at + 5 * rows * h) {}
 };
 
-// Of a tile of rows: h' = n + z (h - n), see packed_gru.py.
+// Of a tile of rows, with the sums of r, z and the candidate's input:
+//     r, z = sigmoid(sums), n = tanh(sum + r (W_hn h + b_hn)), h' = n + z (h - n)
 void gates(int rows, int h, const float* sums, const float* before, float* rz, float* n,
            const float* n_hidden, float* hidden) {
     for (int i = 0; i < rows; ++i)
@@ -269,29 +72,36 @@ extern "C" {
 size_t unroll_tape(int rows, int hidden) { return static_cast<size_t>(rows) * 6 * padded(hidden); }
 
 // q (rows x actions) of the packed rows; sizes[t] rows at time t. parameters: fc1.weight, fc1.bias,
-// rnn.weight_ih, rnn.weight_hh, rnn.bias_ih, rnn.bias_hh, fc2.weight, fc2.bias.
+// rnn.weight_ih, rnn.weight_hh, rnn.bias_ih, rnn.bias_hh, fc2.weight, fc2.bias. Without a tape there
+// is no backward pass, and what it would need is written over with every tile.
 void unroll_forward(int times_, const int* sizes, int rows, int inputs, int hidden, int actions,
                     const float* x, const float* const* parameters, float* q, float* tape_) {
     const Net net(inputs, hidden, actions, parameters);
-    const int h = net.h;
-    const Tape tape(tape_, rows, h);
+    const int h = net.h, most = sizes[0];
+    std::vector<float> scratch, states[2];
+    if (!tape_) {
+        scratch.resize(static_cast<size_t>(TILE) * 6 * h);
+        for (auto& state : states) state.resize(static_cast<size_t>(most) * h);
+    }
+    const Tape tape(tape_ ? tape_ : scratch.data(), tape_ ? rows : TILE, h);
     const std::vector<float> zero(static_cast<size_t>(TILE) * h, 0.0f);
     std::vector<float> sums(static_cast<size_t>(TILE) * 3 * h), out(static_cast<size_t>(TILE) * net.a);
     ptrdiff_t at = 0, earlier = 0;
     for (int t = 0; t < times_; earlier = at, at += sizes[t], ++t) {
+        const float* all_before = tape_ ? tape.hidden + earlier * h : states[(t + 1) % 2].data();
+        float* all_after = tape_ ? tape.hidden + at * h : states[t % 2].data();
         for (int i = 0; i < sizes[t]; i += TILE) {
             const int m = sizes[t] - i < TILE ? sizes[t] - i : TILE;
-            const ptrdiff_t row = at + i;
-            float* embedded = tape.embedded + row * h;
+            const ptrdiff_t row = at + i, kept = tape_ ? row : 0;
+            const float* before = t ? all_before + static_cast<ptrdiff_t>(i) * h : zero.data();
+            float *embedded = tape.embedded + kept * h, *n_hidden = tape.n_hidden + kept * h,
+                  *after = all_after + static_cast<ptrdiff_t>(i) * h;
             times(Start::bias, m, x + row * inputs, inputs, net.fc1, net.bias1.data(), embedded, h);
             for (int j = 0; j < m * h; j += LANES) store(embedded + j, larger(all(0.0f), load(embedded + j)));
-            const float* before = t ? tape.hidden + (earlier + i) * h : zero.data();
-            float* n_hidden = tape.n_hidden + row * h;
             times(Start::bias, m, embedded, h, net.w_ih, net.bias.data(), sums.data(), 3 * h);
             times(Start::c, m, before, h, net.w_hh_rz, nullptr, sums.data(), 3 * h);
             times(Start::bias, m, before, h, net.w_hh_n, net.bias_hn.data(), n_hidden, h);
-            float* after = tape.hidden + row * h;
-            gates(m, h, sums.data(), before, tape.rz + row * 2 * h, tape.n + row * h, n_hidden, after);
+            gates(m, h, sums.data(), before, tape.rz + kept * 2 * h, tape.n + kept * h, n_hidden, after);
             clear_padding(m, h, hidden, after);
             times(Start::bias, m, after, h, net.fc2, net.bias2.data(), out.data(), net.a);
             for (int k = 0; k < m; ++k)
@@ -308,64 +118,65 @@ void unroll_backward(int times_, const int* sizes, int rows, int inputs, int hid
     const Tape tape(tape_, rows, h);
     const float *ih = parameters[2], *hh = parameters[3], *fc2_w = parameters[6];
     Packed back_q = packed(actions, h), back_input = packed(3 * h, h), back_hidden = packed(3 * h, h);
-    for (int k = 0; k < hidden; ++k) {
-        for (int j = 0; j < actions; ++j) put(back_q, j, k, fc2_w[j * hidden + k]);
-        for (int gate = 0; gate < 3; ++gate)
-            for (int j = 0; j < hidden; ++j) {
-                // columns of the gates' gradients: n, r, z, and the candidate's recurrent part
-                const int input_at = gate == 2 ? j : (gate + 1) * h + j;
-                put(back_input, input_at, k, ih[(gate * hidden + j) * hidden + k]);
-                put(back_hidden, gate * h + j, k, hh[(gate * hidden + j) * hidden + k]);
-            }
-    }
-    const size_t count = rows;
-    // Kept between calls: fresh pages cost more than the arithmetic on them.
+    for (int j = 0; j < actions; ++j) put_row(back_q, j, fc2_w + static_cast<ptrdiff_t>(j) * hidden, hidden);
+    for (int gate = 0; gate < 3; ++gate)
+        for (int j = 0; j < hidden; ++j) {
+            // rows are the columns of the gates' gradients: n, r, z, and the candidate's recurrent part
+            const ptrdiff_t from = static_cast<ptrdiff_t>(gate * hidden + j) * hidden;
+            put_row(back_input, gate == 2 ? j : (gate + 1) * h + j, ih + from, hidden);
+            put_row(back_hidden, gate * h + j, hh + from, hidden);
+        }
+    // One time's rows at a time, while they are in the cache. Kept between calls: fresh pages cost more
+    // than the arithmetic on them.
     static thread_local std::vector<float> kept;
-    const size_t needed = count * 7 * h + static_cast<size_t>(sizes[0]) * h;
+    const size_t most = sizes[0], needed = most * 7 * h;  // gates 4, embedded 1, hidden 2
     if (kept.size() < needed) kept.resize(needed);
-    float *grad_hidden = kept.data(), *grad_gates = grad_hidden + count * h,
-          *grad_embedded = grad_gates + count * 4 * h, *previous = grad_embedded + count * h,
-          *unused = previous + count * h;
-    std::memset(previous, 0, sizeof(float) * sizes[0] * h);
-    times(Start::zero, rows, grad_q, actions, back_q, nullptr, grad_hidden, h);
-    ptrdiff_t at = rows;
+    float *grad_gates = kept.data(), *grad_embedded = grad_gates + most * 4 * h,
+          *grad_hidden[] = {grad_embedded + most * h, grad_embedded + most * 2 * h};
+    // Sums over rows: vectors run over the padded side.
+    std::vector<float> w_in(static_cast<size_t>(3 * h) * h), w_re(w_in), w1(static_cast<size_t>(inputs) * h),
+        w2(static_cast<size_t>(actions) * h), b(4 * h), b1(h);
+    const std::vector<float> zero(most * h, 0.0f);
+    ptrdiff_t at = rows - sizes[times_ - 1];
+    times(Start::zero, sizes[times_ - 1], grad_q + at * actions, actions, back_q, nullptr,
+          grad_hidden[(times_ - 1) % 2], h);
     for (int t = times_ - 1; t >= 0; --t) {
-        at -= sizes[t];
+        const int count = sizes[t];
         const ptrdiff_t earlier = t ? at - sizes[t - 1] : 0;
-        float* into = t ? grad_hidden + earlier * h : unused;
-        for (int i = 0; i < sizes[t]; ++i) {
-            const ptrdiff_t row = at + i;
-            const float *rz = tape.rz + row * 2 * h, *n = tape.n + row * h, *nh = tape.n_hidden + row * h;
-            float *g = grad_gates + row * 4 * h, *b = previous + row * h;
-            if (t) std::memcpy(b, tape.hidden + (earlier + i) * h, sizeof(float) * h);
+        const float* before = t ? tape.hidden + earlier * h : zero.data();
+        float *from = grad_hidden[t % 2], *into = grad_hidden[(t + 1) % 2];
+        if (t) times(Start::zero, sizes[t - 1], grad_q + earlier * actions, actions, back_q, nullptr, into, h);
+        for (ptrdiff_t i = 0; i < count; ++i) {
+            const float *rz = tape.rz + (at + i) * 2 * h, *n = tape.n + (at + i) * h,
+                        *nh = tape.n_hidden + (at + i) * h;
+            float* g = grad_gates + i * 4 * h;
             for (int j = 0; j < h; j += LANES) {
-                const Vec grad = load(grad_hidden + row * h + j), one = all(1.0f);
-                const Vec r = load(rz + j), z = load(rz + h + j), c = load(n + j), p = load(b + j);
+                const Vec grad = load(from + i * h + j), one = all(1.0f);
+                const Vec r = load(rz + j), z = load(rz + h + j), c = load(n + j), p = load(before + i * h + j);
                 const Vec d_n = mul(mul(grad, sub(one, z)), sub(one, mul(c, c)));
                 const Vec d_nh = mul(d_n, r), g_z = mul(grad, z);
                 store(g + j, d_n);
                 store(g + h + j, mul(mul(d_nh, load(nh + j)), sub(one, r)));
                 store(g + 2 * h + j, mul(mul(g_z, sub(p, c)), sub(one, z)));
                 store(g + 3 * h + j, d_nh);
-                store(into + i * h + j, add(load(into + i * h + j), g_z));
+                if (t) store(into + i * h + j, add(load(into + i * h + j), g_z));
             }
         }
-        float* sums = grad_gates + at * 4 * h;
-        times(Start::c, sizes[t], sums + h, 4 * h, back_hidden, nullptr, into, h);
-        float* ge = grad_embedded + at * h;
-        times(Start::zero, sizes[t], sums, 4 * h, back_input, nullptr, ge, h);
-        for (ptrdiff_t j = 0; j < static_cast<ptrdiff_t>(sizes[t]) * h; j += LANES)
-            store(ge + j, where_positive(load(tape.embedded + at * h + j), load(ge + j)));
+        if (t) {
+            times(Start::c, count, grad_gates + h, 4 * h, back_hidden, nullptr, into, h);
+            add_over_rows(count, grad_gates + h, 4 * h, 3 * h, before, h, h, w_re.data(), h);
+        }
+        times(Start::zero, count, grad_gates, 4 * h, back_input, nullptr, grad_embedded, h);
+        const float* embedded = tape.embedded + at * h;
+        for (ptrdiff_t j = 0; j < static_cast<ptrdiff_t>(count) * h; j += LANES)
+            store(grad_embedded + j, where_positive(load(embedded + j), load(grad_embedded + j)));
+        add_over_rows(count, grad_gates, 4 * h, 3 * h, embedded, h, h, w_in.data(), h);
+        add_over_rows(count, x + at * inputs, inputs, inputs, grad_embedded, h, h, w1.data(), h);
+        add_over_rows(count, grad_q + at * actions, actions, actions, tape.hidden + at * h, h, h, w2.data(), h);
+        add_column_sums(count, grad_gates, 4 * h, 4 * h, b.data());
+        add_column_sums(count, grad_embedded, h, h, b1.data());
+        at = earlier;
     }
-    // Sums over rows: vectors run over the padded side.
-    std::vector<float> w_in(static_cast<size_t>(3 * h) * h), w_re(w_in), w1(static_cast<size_t>(inputs) * h),
-        w2(static_cast<size_t>(actions) * h), b(4 * h), b1(h);
-    over_rows(rows, grad_gates, 4 * h, 3 * h, tape.embedded, h, h, w_in.data(), h);
-    over_rows(rows, grad_gates + h, 4 * h, 3 * h, previous, h, h, w_re.data(), h);
-    over_rows(rows, x, inputs, inputs, grad_embedded, h, h, w1.data(), h);
-    over_rows(rows, grad_q, actions, actions, tape.hidden, h, h, w2.data(), h);
-    column_sums(rows, grad_gates, 4 * h, 4 * h, b.data());
-    column_sums(rows, grad_embedded, h, h, b1.data());
     for (int j = 0; j < hidden; ++j) {
         gradients[1][j] = b1[j];
         for (int k = 0; k < inputs; ++k) gradients[0][j * inputs + k] = w1[k * h + j];
@@ -379,13 +190,7 @@ void unroll_backward(int times_, const int* sizes, int rows, int inputs, int hid
     }
     for (int j = 0; j < actions; ++j) {
         std::memcpy(gradients[6] + j * hidden, w2.data() + j * h, sizeof(float) * hidden);
-        float total = 0.0f;
-        for (int from = 0; from < rows; from += BLOCK) {
-            float sum = 0.0f;
-            for (int i = from; i < rows && i < from + BLOCK; ++i) sum += grad_q[i * actions + j];
-            total += sum;
-        }
-        gradients[7][j] = total;
+        gradients[7][j] = column_sum(rows, grad_q + j, actions);
     }
 }
 }
