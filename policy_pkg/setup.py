@@ -24,7 +24,14 @@ setup(
         "policy_pkg.train.live",
         "policy_pkg.train.offline",
     ],
-    package_data={"policy_pkg": ["configs/**/*.yaml", "ros/*.xml", "learner/native/*.cpp", "learner/native/*.h"]},
+    package_data={
+        "policy_pkg": [
+            "configs/**/*.yaml",
+            "ros/*.xml",
+            "learner/native/*.cpp",
+            "learner/native/*.h",
+        ]
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
         (f"share/{package}", ["package.xml"]),

@@ -256,7 +256,9 @@ def main() -> int:
             packages = fingerprint([base, LOCK])
             stage("packages", "packages (torch is large)", packages, lambda: install_packages(ros))
             if platform.machine() == "x86_64":  # elsewhere torch does the same, slower
-                sources = [path for path in sorted(KERNELS.iterdir()) if path.suffix in (".h", ".cpp")]
+                sources = [
+                    path for path in sorted(KERNELS.iterdir()) if path.suffix in (".h", ".cpp")
+                ]
                 kernels = fingerprint([base, *sources, *KERNEL_OPTIONS, str(KERNEL_FLAGS)])
                 stage("kernel", "learner's kernels", kernels, build_kernels)
             build = fingerprint([packages, *workspace_sources()])

@@ -133,4 +133,4 @@ def test_torch_does_it_where_there_is_no_build(
     np.testing.assert_allclose(q, native_q, atol=1e-5 * np.abs(q).max())
     kernel("avx2")
     with pytest.raises(UserError, match="CRASH_COACH_KERNEL=avx2: this machine has torch"):
-        native.unroll()
+        native.build_name()

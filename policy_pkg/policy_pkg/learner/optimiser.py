@@ -13,7 +13,7 @@ from torch import Tensor
 from policy_pkg.learner.config import LearnerConfig
 from policy_pkg.learner.nets import Nets
 from policy_pkg.learner.replay import Batch
-from policy_pkg.learner.torch_steps import Adam, RMSprop, Steps
+from policy_pkg.learner.torch_steps import Adam, RMSprop, UpdateRule
 
 Array = npt.NDArray[Any]
 _PREFIX = "optimiser."
@@ -104,5 +104,5 @@ def _moments(config: LearnerConfig, parameters: int) -> dict[str, tuple[int, ...
     return {"step": (), **dict.fromkeys(names, (parameters,))}
 
 
-def _make(config: LearnerConfig, flat: Tensor) -> Steps:
+def _make(config: LearnerConfig, flat: Tensor) -> UpdateRule:
     return (Adam if config.optimiser == "adam" else RMSprop)(config, flat)

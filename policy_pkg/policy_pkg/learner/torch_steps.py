@@ -18,8 +18,8 @@ from policy_pkg.learner.config import LearnerConfig
 BETAS = (0.9, 0.999)  # Adam's
 
 
-class Steps(ABC):
-    """Steps against ``tensor.grad``.
+class UpdateRule(ABC):
+    """UpdateRule against ``tensor.grad``.
 
     ``state``: what is kept of earlier steps, by torch's names; empty before the first.
     """
@@ -44,7 +44,7 @@ class Steps(ABC):
     def _apply(self, gradient: Tensor) -> None: ...
 
 
-class RMSprop(Steps):
+class RMSprop(UpdateRule):
     moments = ("square_avg",)
 
     def _apply(self, gradient: Tensor) -> None:
@@ -56,7 +56,7 @@ class RMSprop(Steps):
         )  # fmt: skip
 
 
-class Adam(Steps):
+class Adam(UpdateRule):
     moments = ("exp_avg", "exp_avg_sq")
 
     def _apply(self, gradient: Tensor) -> None:

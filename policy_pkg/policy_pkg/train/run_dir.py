@@ -203,7 +203,7 @@ def describe_run(config: RunConfig, data: dict[str, Any] | None = None) -> dict[
             **{name: version(name) for name in LIBRARIES},
         },
         "machine": platform.machine(),
-        "kernels": {**kernels(), "unroll": native.build_name() or native.TORCH},
+        "kernels": {**kernels(), "learner": native.build_name() or native.TORCH},
         "commit": _commit(),
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
     }

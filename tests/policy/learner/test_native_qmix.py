@@ -15,7 +15,7 @@ from policy_pkg.learner.mixer import Qmix
 
 BUILDS = [name for name in native.FLAGS if native.FLAGS[name] <= native._flags()]
 
-# (robots, state size, mixing layer, hypernetworks, rows): odd sizes, one row, several blocks of rows
+# (robots, state size, mixing layer, hypernetworks, rows): odd sizes, one row, blocks of rows
 CASES = [(2, 5, 20, 33, 1), (3, 7, 32, 64, 37), (8, 216, 32, 64, 900), (5, 8, 40, 70, 300)]
 
 

@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from policy_pkg.learner.config import LearnerConfig
-from policy_pkg.learner.torch_steps import Adam, RMSprop, Steps
+from policy_pkg.learner.torch_steps import Adam, RMSprop, UpdateRule
 
 CONFIG = LearnerConfig(lr=3e-3, optim_eps=1e-6, optim_alpha=0.95)
 
 
-def of_torch(kind: type[Steps], tensor: torch.Tensor) -> torch.optim.Optimizer:
+def of_torch(kind: type[UpdateRule], tensor: torch.Tensor) -> torch.optim.Optimizer:
     if kind is Adam:
         return torch.optim.Adam([tensor], lr=CONFIG.lr, eps=CONFIG.optim_eps)
     return torch.optim.RMSprop(
@@ -20,7 +20,7 @@ def of_torch(kind: type[Steps], tensor: torch.Tensor) -> torch.optim.Optimizer:
 
 
 @pytest.mark.parametrize("kind", [RMSprop, Adam])
-def test_steps_are_the_classes_bit_for_bit(kind: type[Steps]) -> None:
+def test_steps_are_the_classes_bit_for_bit(kind: type[UpdateRule]) -> None:
     torch.manual_seed(5)
     mine = torch.randn(1000).requires_grad_()
     theirs = mine.detach().clone().requires_grad_()

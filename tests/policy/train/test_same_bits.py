@@ -92,7 +92,7 @@ def test_training_has_the_same_bits_on_other_processors(tmp_path: Path, numba: b
         metrics = (tmp_path / name / "metrics.jsonl").read_bytes()
         found[name] = hashlib.sha256(agent.read_bytes() + metrics).hexdigest()
         described = json.loads((tmp_path / name / "run.json").read_text())
-        assert described["kernels"] == {"openblas": "Haswell", "unroll": env[VARIABLE]}
+        assert described["kernels"] == {"openblas": "Haswell", "learner": env[VARIABLE]}
     assert found["this"] == found["older"]
 
 

@@ -17,7 +17,8 @@ from policy_pkg.learner import native
 
 Tape = npt.NDArray[np.float32]
 _INT, _POINTER = ctypes.c_int, ctypes.c_void_p
-_UNROLL, _QMIX = [_INT, _POINTER, *[_INT] * 4], [_INT] * 5
+_UNROLL: list[Any] = [_INT, _POINTER, _INT, _INT, _INT, _INT]
+_QMIX: list[Any] = [_INT] * 5
 # by function: how it begins, and how many pointers follow
 _ARGUMENTS = {
     "unroll_forward": (_UNROLL, 4),
@@ -32,7 +33,7 @@ _TAPES = {"unroll_tape": 2, "qmix_tape": 5}  # by function: how many numbers it 
 def _loaded(name: str, folder: Path) -> ctypes.CDLL:
     found = ctypes.CDLL(str(native.path(name, folder)))
     for function, (sizes, pointers) in _ARGUMENTS.items():
-        getattr(found, function).argtypes = [*sizes, *[_POINTER] * pointers]
+        getattr(found, function).argtypes = sizes + [_POINTER] * pointers
         getattr(found, function).restype = None
     for function, numbers in _TAPES.items():
         getattr(found, function).argtypes = [_INT] * numbers
@@ -41,7 +42,7 @@ def _loaded(name: str, folder: Path) -> ctypes.CDLL:
 
 
 def library(*tensors: Tensor) -> ctypes.CDLL | None:
-    """The kernels for ``tensors``; None: torch does it, as on a GPU, in float64 or without a build."""
+    """The kernels for ``tensors``; None: torch has to do it (GPU, float64, no build)."""
     if not all(x.dtype is torch.float32 and x.is_cpu for x in tensors):
         return None
     name = native.build_name()
