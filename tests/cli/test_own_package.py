@@ -1,5 +1,5 @@
-"""A package from outside the repository adds a scenario kind, a strategy and a fault: all of them
-are used from the command line."""
+"""A package from outside the repository adds a scenario kind, a strategy, a fault and a mixer: all
+of them are used from the command line."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from own_package import POINTS, SOURCE, install
+from own_package import POINTS, SOURCE, install, install_really
+from safetensors.numpy import load_file
 
 from crash_coach_bringup.ros.probe import find_executable
+from policy_pkg.checkpoint import find_checkpoint
 from sim_pkg.scenario_files import SCENARIOS_DIR
 
 STEPS = 300
@@ -25,7 +27,7 @@ test_interval_steps: 100
 test_episodes: 2
 checkpoint_interval_steps: {STEPS}
 tensorboard: false
-learner: {{{{hidden: 16, mixing_hidden: 8, hypernet_hidden: 8}}}}
+learner: {{{{algorithm: weighted, hidden: 16, mixing_hidden: 8, hypernet_hidden: 8}}}}
 coach: {{{{strategy: steady, crash_mode: limp, crash_parameters: {{{{every: 3}}}}}}}}
 """
 
@@ -49,9 +51,9 @@ def patrol(folder: Path, reward_company: float) -> Path:
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("site")
-    install(folder)
-    return folder
+    folder = tmp_path_factory.mktemp("outside")
+    install_really(folder / "own_robots", folder / "site")
+    return folder / "site"
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +71,16 @@ def test_the_strategy_decides_the_rate_of_the_training(run: Path) -> None:
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert [line["alpha"] for line in lines] == [0.25, 0.5, 0.5, 0.5]
     assert lines[-1]["crashed_fraction"] > 0
+
+
+def test_the_mixer_is_what_the_training_learns(run: Path) -> None:
+    kept = load_file(find_checkpoint(run) / "learner.safetensors")
+    assert {name for name in kept if "mixer" in name} == {
+        f"{net}.mixer.{layer}.{part}"
+        for net in ("online", "target")
+        for layer in ("weigh", "value")
+        for part in ("weight", "bias")
+    }
 
 
 def test_the_team_is_evaluated_on_the_kind_under_the_fault(

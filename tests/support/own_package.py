@@ -1,7 +1,11 @@
-"""A package from outside the repository: a scenario kind, a coaching strategy and a fault mode."""
+"""A package from outside the repository: a scenario kind, a coaching strategy, a fault mode and a
+mixer, each of them an entry point."""
 
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 SOURCE = '''
@@ -69,6 +73,24 @@ class Limp(CommandFault):
         self._count += 1
         return None if self._count % self.parameters.every == 0 else command
 '''
+
+MIXERS = '''
+from torch import nn
+
+from policy_pkg.learner.layers import Linear
+
+
+class Weighted(nn.Module):
+    """Q_tot = sum_i |w_i(s)| q_i + V(s)."""
+
+    def __init__(self, sizes, config):
+        super().__init__()
+        self.weigh = Linear(sizes.state_size, sizes.n_robots)
+        self.value = Linear(sizes.state_size, 1)
+
+    def forward(self, values, state):
+        return (self.weigh(state).abs() * values).sum(1) + self.value(state).squeeze(1)
+'''
 POINTS = """
 [crash_coach.scenarios]
 patrol = own:KIND
@@ -78,7 +100,32 @@ steady = own:Steady
 
 [crash_coach.faults]
 limp = own:Limp
+
+[crash_coach.mixers]
+weighted = own_mixers:Weighted
 """
+PROJECT = """
+[project]
+name = "own-robots"
+version = "1.0"
+
+[tool.setuptools]
+py-modules = ["own", "own_mixers"]
+"""
+
+
+def install_really(source: Path, site: Path) -> None:
+    """The package's project in ``source``, built and installed into ``site`` by an installer."""
+    source.mkdir()
+    (source / "own.py").write_text(SOURCE)
+    (source / "own_mixers.py").write_text(MIXERS)
+    points = POINTS.replace("[", '[project.entry-points."').replace("]", '"]')
+    quoted = re.sub(r"(?m)^(\w+) = (.+)$", r'\1 = "\2"', points)
+    (source / "pyproject.toml").write_text(PROJECT + quoted)
+    uv = str(Path(sys.executable).with_name("uv"))
+    options = ["--no-deps", "--no-build-isolation", "--offline", "--target", str(site)]
+    command = [uv, "pip", "install", "--python", sys.executable, *options, str(source)]
+    subprocess.run(command, check=True, capture_output=True, timeout=100)
 
 
 def install(site: Path, source: str = SOURCE, points: str = POINTS) -> None:
