@@ -28,8 +28,8 @@ setup(
     zip_safe=False,
     entry_points={
         "console_scripts": [
-            "coach = crash_coach_pkg.ros.coach_node:main",
-            "gate = crash_coach_pkg.ros.gate_node:main",
+            "coach = crash_coach_pkg.executables:coach",
+            "gate = crash_coach_pkg.executables:gate",
         ],
     },
 )

@@ -42,10 +42,10 @@ setup(
     zip_safe=False,
     entry_points={
         "console_scripts": [
-            "policy = policy_pkg.ros.policy_node:main",
-            "recorder = policy_pkg.ros.recorder_node:main",
-            "team = policy_pkg.ros.team_node:main",
-            "trainer = policy_pkg.ros.trainer.node:main",
+            "policy = policy_pkg.executables:policy",
+            "recorder = policy_pkg.executables:recorder",
+            "team = policy_pkg.executables:team",
+            "trainer = policy_pkg.executables:trainer",
         ],
     },
 )

@@ -26,7 +26,7 @@ setup(
     zip_safe=False,
     entry_points={
         "console_scripts": [
-            "sim = sim_pkg.ros.sim_node:main",
+            "sim = sim_pkg.executables:sim",
         ],
     },
 )

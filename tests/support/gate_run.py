@@ -52,6 +52,7 @@ class Run:
         default_factory=lambda: defaultdict(list)
     )  # by robot: (episode, first step, mode, entry) of ACTIVE without its end
     observed: set[Key] = field(default_factory=set)
+    wholes: int = 0  # steps that the gate took at once
     clears: list[tuple[int, int]] = field(default_factory=list)  # of the team: (episode, step)
 
     def __post_init__(self) -> None:
@@ -174,13 +175,12 @@ class Run:
             case "delay":
                 action = delayed(entered, int(fault.parameters[0][1]), key)
                 return (action if action != WITHHELD and AVAILABLE[action] else WITHHELD,)
-        frozen = [
-            d.applied
+        wanted = [
+            d.command.action
             for k, d in self.decided.items()
             if k[0] == key[0] and k[2] == key[2] and k[1] < entered[0]
         ]
-        passed = [a for a in frozen if a != WITHHELD]
-        return (passed[-1] if passed and AVAILABLE[passed[-1]] else WITHHELD,)
+        return (wanted[-1] if wanted and AVAILABLE[wanted[-1]] else WITHHELD,)
 
     def sight(self, seen: Seen) -> None:
         key = (*seen.sight.key, seen.sight.robot)
@@ -252,6 +252,25 @@ class Run:
         if (self.episode, self.steps[robot], robot) in self.decided:
             self.steps[robot] += 1
 
+    def together(self) -> None:
+        """Every robot's command at once, where none has to be looked at; else one by one."""
+        step, term = self.steps[0], self.gate.book.at(self.steps[0])
+        revision = self.gate.book.revision if term is None else term.revision
+        commands = [
+            Command(robot, self.episode, step, ACTIONS[(step + robot) % 4], WORST)
+            for robot in range(ROBOTS)
+        ]
+        keeping_step = len(set(self.steps)) == 1 and not self.relays
+        if not keeping_step or not self.gate.whole_step(self.episode, step, lambda: commands):
+            for robot in range(ROBOTS):
+                self.answer(robot)
+            return
+        self.wholes += 1
+        assert not self.gate.whole_step(self.episode, step, lambda: commands), "decided twice"
+        self.asked.update((self.episode, step, robot) for robot in range(ROBOTS))
+        self.take(tuple(Decision(c, "", 0, c.action, revision) for c in commands))
+        self.steps = [step + 1] * ROBOTS
+
     def silence(self, seconds: float) -> None:
         self.now_s += seconds
         self.take(self.gate.tick(self.now_s))
@@ -271,10 +290,8 @@ class Run:
                 self.next_episode(argument)
             case "silence", float():
                 self.silence(argument)
-            case "beat", _:
-                self.beat()
-            case "repeat", _:
-                self.repeat()
+            case "beat" | "repeat" | "together", _:
+                getattr(self, operation)()
             case _:
                 self.plan(())
 

@@ -7,6 +7,9 @@ each of them.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 from crash_coach_common.contract import BoolArray
 from crash_coach_pkg.effects import OBSERVED, WITHHELD
 from crash_coach_pkg.faults import fault_mode, is_observation_mode
@@ -21,6 +24,14 @@ from crash_coach_pkg.schedule import World
 
 _UNKNOWN = 2**32  # beyond every episode
 _FROM_OBSERVATION: frozenset[Need] = frozenset(("availability", "sampler"))
+
+
+class _Whole(NamedTuple):
+    """A step of all robots that passed untouched, and that nobody has looked into yet."""
+
+    key: tuple[int, int]
+    revision: int
+    commands: Callable[[], list[Command]]
 
 
 class GateState:
@@ -69,9 +80,11 @@ class GateState:
         self._held_sights: list[Sight | None] = [None] * n_robots
         self._masks: list[tuple[tuple[int, int], BoolArray] | None] = [None] * n_robots
         self._worlds = Worlds(n_robots, self._lockstep)
+        self._whole: _Whole | None = None
 
     def last(self, robot: int) -> Decision | None:
         """The newest decision on ``robot``."""
+        self._look_into()
         return self._last[robot]
 
     @property
@@ -129,8 +142,43 @@ class GateState:
             self._begin_anew()
         return restarted
 
+    def whole_step(self, episode: int, step: int, commands: Callable[[], list[Command]]) -> bool:
+        """Takes every robot's command of a step at once, where all of them pass untouched.
+
+        Args:
+            commands: makes them; called if and when they are looked at.
+
+        Returns False, and has changed nothing, where they have to be taken one by one.
+        """
+        book, key = self.book, (episode, step)
+        term = book.at(step)
+        if episode != book.episode or (term is not None and term.faulted):
+            return False
+        if self._whole is None:
+            if any(done >= key for done in self._done) or any(self._held):
+                return False
+            if any(stream.team is not None or stream.running for stream in self._commands):
+                return False
+        elif key <= self._whole.key:
+            return False
+        self._whole = _Whole(key, book.revision if term is None else term.revision, commands)
+        book.next_step = max(book.next_step, step + 1)
+        return True
+
+    def _look_into(self) -> None:
+        """Notes of each robot what was taken as a whole."""
+        if self._whole is None:
+            return
+        whole, self._whole = self._whole, None
+        for command in whole.commands():
+            robot, action = command.robot, command.action
+            self._done[robot] = whole.key
+            self._last[robot] = Decision(command, "", 0, action, whole.revision)
+            self._commands[robot].passed = self._commands[robot].wanted = action
+
     def command(self, command: Command, now_s: float) -> Outputs:
         """Decides a command, repeats the decision for a duplicate, holds or drops it."""
+        self._look_into()
         if command.episode > self._last_episode:
             self.ahead[command.robot] += 1
             return ()
@@ -154,6 +202,7 @@ class GateState:
 
     def observation(self, sight: Sight, now_s: float) -> Outputs:
         """Takes an observation: its availability, and all of it where observations are relayed."""
+        self._look_into()
         robot = sight.robot
         self._masks[robot] = (sight.key, sight.available)
         outputs = self._see(sight, now_s) if self._relays else ()

@@ -64,6 +64,10 @@ class TeamHealth:
         """A command of ``robot`` came, whatever became of it."""
         self._heard_s[robot] = self._counted_s(now_s)
 
+    def all_heard(self, now_s: float) -> None:
+        """A command of every robot came."""
+        self._heard_s = [self._counted_s(now_s)] * len(self._heard_s)
+
     def intruders(self, robot: int, who: tuple[str, ...]) -> None:
         """Who else publishes on the robot's command topic now; empty: nobody."""
         self._intruders[robot] = who

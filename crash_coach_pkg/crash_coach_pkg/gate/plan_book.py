@@ -66,12 +66,16 @@ def why_not(plan: CrashPlan, offered: frozenset[Need], observations: bool) -> st
         if unmet := unmet_needs(fault.mode, offered):
             return unmet
         if is_observation_mode(fault.mode) and not observations:
-            return (
-                f"fault {fault.mode} changes observations, which this gate does not relay: start "
-                "it with relay_observations:=true, and the policies with "
-                "observation_topic:=observation_seen"
-            )
+            return not_relayed(fault.mode)
     return ""
+
+
+def not_relayed(mode: str) -> str:
+    """What is said of a fault of observations to a gate that does not relay them."""
+    return (
+        f"fault {mode} changes observations, which this gate does not relay: start it with "
+        "relay_observations:=true, and the policies with observation_topic:=observation_seen"
+    )
 
 
 @dataclass(eq=False, slots=True)

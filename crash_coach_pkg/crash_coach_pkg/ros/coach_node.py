@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
@@ -52,7 +52,10 @@ from crash_coach_pkg.coach.parameters import (
     counts_now,
     parameter_specs,
 )
+from crash_coach_pkg.faults import is_observation_mode
+from crash_coach_pkg.gate.plan_book import not_relayed
 from crash_coach_pkg.ros.coach_link import CoachLink
+from crash_coach_pkg.ros.endpoints import leaves_observations
 from crash_coach_pkg.ros.robot_names import robot_names
 
 
@@ -97,6 +100,8 @@ class CoachNode(Node):
     def start(self) -> None:
         """Serves parameters and services in a thread."""
         self._served = self._threads.submit(self._serve)
+        how = self._scenario or f"strategy {self._values['strategy']}"
+        self.get_logger().info(f"ready: {how} for {', '.join(self._team.robots)}")
 
     def destroy_node(self) -> None:
         self._stop.set()
@@ -125,6 +130,7 @@ class CoachNode(Node):
             check_beside(self._scenario, tuple(changed))
             settings = build_settings(values, self._team)
             check_change(settings, tuple(changed))
+            self._check_gate(changed)
         except UserError as error:
             return SetParametersResult(successful=False, reason=str(error))
         disabling = "enabled" in changed and not settings.enabled
@@ -140,6 +146,12 @@ class CoachNode(Node):
                 return SetParametersResult(successful=False, reason=answer)
         self._values, self._unconfirmed = values, answer
         return SetParametersResult(successful=True)
+
+    def _check_gate(self, changed: Mapping[str, Value]) -> None:
+        """Raises UserError for a mode that the gate could only refuse later, with its episode."""
+        mode = str(changed.get("crash_mode", ""))
+        if mode and is_observation_mode(mode) and leaves_observations(self):
+            raise UserError(f"the gate would refuse: {not_relayed(mode)}")
 
     def _on_clear_all(
         self, request: Trigger.Request, response: Trigger.Response

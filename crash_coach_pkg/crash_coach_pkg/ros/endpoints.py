@@ -6,7 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from rclpy.node import Node
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 UNKNOWN = "_NODE_NAME_UNKNOWN_"  # rmw's word
@@ -59,6 +60,25 @@ def types_published(node: Node, topics: Iterable[str]) -> frozenset[str]:
     )
 
 
+def leaves_observations(node: Node) -> bool:
+    """Whether gates are on the graph, and none of them relays observations."""
+    gates = [
+        (info.node_name, info.node_namespace)
+        for info in node.get_publishers_info_by_topic("coach/events")
+        if info.node_name != UNKNOWN
+    ]
+    try:
+        types = [
+            type_name
+            for name, namespace in gates
+            for _, names in node.get_publisher_names_and_types_by_node(name, namespace)
+            for type_name in names
+        ]
+    except NodeNameNonExistentError:  # it has just gone
+        return False
+    return bool(gates) and "crash_coach_interfaces/msg/Observation" not in types
+
+
 def _full_name(info: Any) -> str:
     return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
 
@@ -77,20 +97,28 @@ class WatchedPublisher:
     Ours is known by its gid: a second gate of the same name is an intruder as well.
     """
 
-    def __init__(self, node: Node, type_: type, topic: str, qos: QoSProfile) -> None:
+    def __init__(
+        self,
+        node: Node,
+        type_: type,
+        topic: str,
+        qos: QoSProfile,
+        events: PublisherEventCallbacks | None = None,
+    ) -> None:
         self._node = node
         self._name = topic  # remapping is applied to it, not to what comes of that
         before = publishers_on(node, topic)
-        self._publisher = node.create_publisher(type_, topic, qos)
+        self._publisher = node.create_publisher(type_, topic, qos, event_callbacks=events)
         name = node.get_fully_qualified_name()
         # rclpy does not tell a publisher's gid. Our own is on the graph at once, others only
         # after their discovery.
         self._own = {e.gid for e in publishers_on(node, topic) - before if e.node == name}
         self._seen: frozenset[Endpoint] = frozenset()
         self._met: set[str] = set()
-        self.topic: str = self._publisher.topic_name
+        self.topic_name: str = self._publisher.topic_name
         self.publish = self._publisher.publish
         """A message, or its serialized bytes."""
+        self.get_subscription_count = self._publisher.get_subscription_count
 
     @property
     def intruders(self) -> tuple[Endpoint, ...]:

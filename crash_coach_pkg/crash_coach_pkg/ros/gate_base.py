@@ -12,6 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
@@ -143,9 +144,15 @@ class GateBase(Node):
         value: bool = self.declare_parameter(name, default, descriptor).value
         return value
 
-    def command_publisher(self, robot: int, type_: type, qos: QoSProfile) -> WatchedPublisher:
+    def command_publisher(
+        self,
+        robot: int,
+        type_: type,
+        qos: QoSProfile,
+        events: PublisherEventCallbacks | None = None,
+    ) -> WatchedPublisher:
         """Publishes what ``robot`` gets; others that do so too are reported as intruders."""
-        publisher = WatchedPublisher(self, type_, self.topics.commands[robot], qos)
+        publisher = WatchedPublisher(self, type_, self.topics.commands[robot], qos, events)
         self._outputs.append((robot, publisher))
         return publisher
 
@@ -162,6 +169,8 @@ class GateBase(Node):
         self.create_timer(TICK_S, lambda: gate.tick(time.monotonic()), clock=steady)
         self.create_timer(DIAGNOSTICS_S, lambda: self._on_diagnostics(gate), clock=steady)
         self._tell_plan()  # a coach that starts need not wait for what is in force
+        team = ", ".join(self.robots)
+        self.get_logger().info(f"ready: relays commands ({self.command_type}) of {team}")
 
     def send_events(self, events: Iterable[Event]) -> None:
         """To /coach/events; a plan that they change to /coach/plan_in_force."""
@@ -250,12 +259,13 @@ class GateBase(Node):
                     at.step,
                     revision,
                     robot,
-                    detail=f"{who} publishes on {output.topic} too ({count} publishers)",
+                    detail=f"{who} publishes on {output.topic_name} too ({count} publishers)",
                 )
                 for who in sighting.appeared
             )
             for who in sighting.appeared:
-                self.get_logger().warning(f"{who} publishes on {output.topic}, beside this gate")
+                topic = output.topic_name
+                self.get_logger().warning(f"{who} publishes on {topic}, beside this gate")
 
     def destroy_node(self) -> None:
         if self._gate is not None:

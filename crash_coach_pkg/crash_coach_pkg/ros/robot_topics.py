@@ -18,7 +18,8 @@ class RobotTopics:
     """Parameters: raw_topic, command_topic, robot_namespaces.
 
     ``raw`` and ``commands``: what the gate relays, and to where, of each robot, as written:
-    rclpy still applies the node's namespace and remapping, as to every name.
+    rclpy still applies the node's namespace and remapping, as to every name. ``raw_name`` and
+    ``command_name``: the parameters.
 
     Raises:
         UserError: a name that is none, not one namespace for each robot, two robots that share a
@@ -30,8 +31,10 @@ class RobotTopics:
         self._robots = robots
         self._namespaces = self._declare_namespaces()
         about = "within each robot's namespace; with a leading '/' this very topic"
-        self.raw = self._declare("raw_topic", defaults[0], f"What is relayed, {about}.")
-        self.commands = self._declare(
+        self.raw_name, self.raw = self._declare(
+            "raw_topic", defaults[0], f"What is relayed, {about}."
+        )
+        self.command_name, self.commands = self._declare(
             "command_topic", defaults[1], f"Where it is relayed to, {about}."
         )
         check_wiring(robots, self._resolved(self.raw), self._resolved(self.commands))
@@ -71,7 +74,7 @@ class RobotTopics:
         self._told[robot, listening] = text
         return text
 
-    def _declare(self, parameter: str, default: str, description: str) -> list[str]:
+    def _declare(self, parameter: str, default: str, description: str) -> tuple[str, list[str]]:
         descriptor = ParameterDescriptor(description=description, read_only=True)
         name: str = self._node.declare_parameter(parameter, default, descriptor).value
         if not name.strip("/"):
@@ -83,7 +86,7 @@ class RobotTopics:
         except (NameValidationException, RCLError) as error:
             reason = str(error).splitlines()[0].split(", at /")[0]
             raise UserError(f"parameter {parameter} = {name!r}: {reason}") from None
-        return topics
+        return name, topics
 
     def _declare_namespaces(self) -> list[str]:
         descriptor = ParameterDescriptor(

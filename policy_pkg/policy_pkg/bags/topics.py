@@ -51,7 +51,7 @@ OF_ROBOT = (Kind.OBSERVATION, Kind.SEEN, Kind.INTENT, Kind.COMMAND)
 def kind_of(topic: str) -> tuple[Kind, str] | None:
     """(kind, robot or '') of a topic; None for one that the reader does not need."""
     parts = topic.split("/")
-    if len(parts) == 3 and parts[1]:
+    if len(parts) == 3 and parts[1] and not parts[1].startswith("_"):  # hidden: of the team
         for kind in OF_ROBOT:
             if kind.value == parts[2]:
                 return kind, parts[1]

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import TYPE_CHECKING
 
-from crash_coach_interfaces.msg import Action, Observation
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 
 from crash_coach_common.contract import UserError
-from crash_coach_common.ros.qos import NEWEST
 from crash_coach_common.ros.run_node import run, serving
+from crash_coach_common.ros.team_topics import COMMANDS, OBSERVATIONS, TeamPublisher, subscribe
+from crash_coach_common.team_cdr import RobotMessage
 from policy_pkg.act import Exploration, greedy, least_valued
-from policy_pkg.agent import Agent
+from policy_pkg.agent import Agent, Answer
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.ros.agent_params import PolicyParameters, TeamParameters, read_parameters
 from policy_pkg.ros.convert import bytes_from_answer, sensed_from_bytes
@@ -38,7 +36,7 @@ class AgentNode(Node):
         parameters = read_parameters(self, PolicyParameters if one_robot else TeamParameters)
         robots = (parameters.robot,) if isinstance(parameters, PolicyParameters) else ()
         self._topics = (parameters.observation_topic, parameters.command_topic)
-        self._commands: list[Publisher] = []
+        self._lockstep = parameters.lockstep
         self.failure: UserError | None = None
         """Why the node has to end; an exception in a callback would be told with a traceback."""
         if parameters.live:
@@ -51,26 +49,33 @@ class AgentNode(Node):
         """Opens the topics of ``robots``; ``receive`` answers their observations."""
         observation_topic, command_topic = self._topics
         self._receive = receive
-        self._commands = [
-            self.create_publisher(Action, f"{name}/{command_topic}", NEWEST) for name in robots
-        ]
-        for index, name in enumerate(robots):
-            self.create_subscription(
-                Observation,
-                f"{name}/{observation_topic}",
-                partial(self._on_observation, index),
-                NEWEST,
-                raw=True,
-            )
+        commands = [f"{name}/{command_topic}" for name in robots]
+        observations = [f"{name}/{observation_topic}" for name in robots]
+        self._commands = TeamPublisher(self, COMMANDS, robots, commands, command_topic)
+        subscribe(
+            self,
+            OBSERVATIONS,
+            robots,
+            observations,
+            observation_topic,
+            self._on_observations,
+            self._on_error,
+            self._lockstep,
+        )
+        self.get_logger().info(f"ready: acts for {', '.join(robots)}")
 
-    def _on_observation(self, robot: int, message: bytes) -> None:
+    def _on_error(self, error: UserError) -> None:
+        self.failure = error
+
+    def _on_observations(self, messages: list[RobotMessage]) -> None:
+        answers: list[Answer[bytes]] = []
         try:
-            answers = self._receive(robot, sensed_from_bytes(message))
+            for robot, data in messages:
+                answers += self._receive(robot, sensed_from_bytes(data))
         except UserError as error:
             self.failure = error
             return
-        for answer in answers:
-            self._commands[answer.robot].publish(bytes_from_answer(answer))
+        self._commands.publish([(it.robot, bytes_from_answer(it)) for it in answers])
 
 
 def make_agent(

@@ -30,6 +30,11 @@ class TeamParameters(BaseModel):
         min_length=1,
         description="acts on /<robot>/<this>; observation_seen where the gate relays observations",
     )
+    lockstep: bool = Field(
+        False,
+        description="the sim is in lock-step and asks again for what is lost: nothing is "
+        "acknowledged, which is faster",
+    )
     epsilon: float = Field(
         0.0,
         ge=0,

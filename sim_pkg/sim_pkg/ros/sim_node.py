@@ -14,6 +14,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from crash_coach_common.contract import UserError
 from crash_coach_common.ros.run_node import run, serving
+from crash_coach_common.team_cdr import RobotMessage
 from sim_pkg.env import make_env
 from sim_pkg.lockstep import Decisions
 from sim_pkg.pause import Pause
@@ -58,11 +59,19 @@ class SimNode(Node):
         period_s = env.spec.dt_s / params.real_time_factor
         self._newest = NewestCommands(env.spec.robots, params.cmd_timeout_s or 3 * period_s)
         self._phase = _Phase.MATCHING
+        self._succeeded = 0  # episodes
         self._pause = Pause(period_s, time.monotonic)
         self._robot_indexes = {name: i for i, name in enumerate(env.spec.robots)}
         arena = ArenaView(self, env, self._lockstep, params.arena_hz, time.monotonic)
         self._topics = SimTopics(
-            self, arena, env.spec, params.seed, self._on_command, self._on_event
+            self,
+            arena,
+            env.spec,
+            params.seed,
+            self._on_commands,
+            self._on_error,
+            self._on_event,
+            self._lockstep,
         )
         self.create_service(Trigger, "sim/reset", self._on_reset)
         self.create_service(Trigger, "sim/step", self._on_step)
@@ -111,6 +120,8 @@ class SimNode(Node):
         self._match_timer.cancel()
         self._topics.refresh_listeners()
         self._phase = _Phase.IDLE
+        starts = "" if self._params.autostart else "; /sim/reset starts each episode"
+        self.get_logger().info(f"ready: {self._params.scenario}, {self._params.mode}{starts}")
         if self._params.autostart:
             self._begin()
 
@@ -131,6 +142,13 @@ class SimNode(Node):
         self._topics.publish_step(session)
 
     # --- stepping ---------------------------------------------------------------------------
+
+    def _on_error(self, error: UserError) -> None:
+        self._fail(str(error))
+
+    def _on_commands(self, messages: list[RobotMessage]) -> None:
+        for robot, data in messages:
+            self._on_command(robot, data)
 
     def _on_command(self, robot: int, data: bytes) -> None:
         try:
@@ -197,8 +215,12 @@ class SimNode(Node):
         """Publishes the end and starts what comes next."""
         self._decisions.close()
         self._topics.publish_step(self._session)
+        self._succeeded += self._session.success
         if self._session.begun == self._params.episodes:
             self._phase = _Phase.DONE
+            self.get_logger().info(
+                f"{self._session.begun} episodes are over: {self._succeeded} successes"
+            )
         elif self._params.autostart:
             self._begin()
         else:
@@ -214,7 +236,7 @@ class SimNode(Node):
             self._fail(str(error))
             return
         self._sent_s = time.monotonic()
-        self._topics.publish_observations(silent)
+        self._topics.observe_again(silent)
 
     def _fail(self, text: str) -> None:
         """Ends the episode loudly: readers see it cut short, the process exits with an error."""

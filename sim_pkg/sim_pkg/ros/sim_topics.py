@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
-from crash_coach_interfaces.msg import Action, EpisodeState, FaultEvent, Observation
+from crash_coach_interfaces.msg import EpisodeState, FaultEvent
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from rclpy.duration import Duration
@@ -15,8 +14,10 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
-from crash_coach_common.contract import EnvSpec
+from crash_coach_common.contract import EnvSpec, UserError
 from crash_coach_common.ros.peers import several
+from crash_coach_common.ros.team_topics import COMMANDS, OBSERVATIONS, TeamPublisher, subscribe
+from crash_coach_common.team_cdr import RobotMessage
 from sim_pkg.lockstep import Decisions
 from sim_pkg.realtime import NewestCommands
 from sim_pkg.ros import convert
@@ -43,8 +44,10 @@ class SimTopics:
         arena: ArenaView,
         spec: EnvSpec,
         seed: int,
-        on_command: Callable[[int, bytes], None],
+        on_commands: Callable[[list[RobotMessage]], None],
+        on_error: Callable[[UserError], None],
         on_event: Callable[[FaultEvent], None],
+        lockstep: bool,
     ) -> None:
         self._node = node
         self._arena = arena
@@ -66,14 +69,13 @@ class SimTopics:
         self._clock_pub = pub(Clock, "clock", _reliable(10))
         self._markers_pub = pub(MarkerArray, "sim/markers", _reliable(10))
         self._diagnostics_pub = pub(DiagnosticArray, "diagnostics", _reliable(10))
-        self._obs_pubs = [pub(Observation, f"{r}/observation", _reliable(1)) for r in spec.robots]
+        observed = [f"{robot}/observation" for robot in spec.robots]
+        self._obs_pub = TeamPublisher(node, OBSERVATIONS, spec.robots, observed, "observation")
         self._odom_pubs = [pub(Odometry, f"{r}/odom", _reliable(10)) for r in spec.robots]
-        self._command_subs = [
-            node.create_subscription(
-                Action, f"{robot}/command", partial(on_command, i), _reliable(1), raw=True
-            )
-            for i, robot in enumerate(spec.robots)
-        ]
+        commanded = [f"{robot}/command" for robot in spec.robots]
+        self._command_subs = subscribe(
+            node, COMMANDS, spec.robots, commanded, "command", on_commands, on_error, lockstep
+        )
         node.create_subscription(FaultEvent, EVENTS_TOPIC, on_event, _reliable(100))
         self._draw = False
         self._odom: list[int] = []
@@ -82,6 +84,7 @@ class SimTopics:
         """Notes who listens to what is built on demand only (odometry, markers)."""
         self._draw = self._markers_pub.get_subscription_count() > 0
         self._arena.refresh_listeners()
+        self._obs_pub.look()
         self._odom = [
             i for i, pub in enumerate(self._odom_pubs) if pub.get_subscription_count() > 0
         ]
@@ -89,7 +92,7 @@ class SimTopics:
     def unmatched(self) -> list[str]:
         """Topics that nobody listens on (observations) or publishes (commands)."""
         missing = []
-        for pub, sub in zip(self._obs_pubs, self._command_subs, strict=True):
+        for pub, sub in zip(self._obs_pub.robots, self._command_subs, strict=True):
             if pub.get_subscription_count() == 0:
                 missing.append(f"{pub.topic_name} has no subscriber")
             if sub.get_publisher_count() == 0:
@@ -102,8 +105,7 @@ class SimTopics:
         self._clock_pub.publish(self._clock)
         if session.running and session.step > 0:
             # The policies work while the rest is published.
-            self._observations.fill(session)
-            self.publish_observations(range(self._spec.n_robots))
+            self._observe(session)
             self._episode_pub.publish(self._episode.fill(session))
         else:
             # A new episode: its plan takes longest. An ended one: nothing to observe.
@@ -111,8 +113,7 @@ class SimTopics:
             self._boundary_pub.publish(state)
             self._episode_pub.publish(state)
             if session.running:
-                self._observations.fill(session)
-                self.publish_observations(range(self._spec.n_robots))
+                self._observe(session)
         self._arena.look(session, self._header)
         if self._draw:
             self._markers_pub.publish(convert.markers(session, self._header))
@@ -123,10 +124,13 @@ class SimTopics:
         """Shows viewers the newest state where it came too soon after the one before it."""
         self._arena.catch_up(session, self._header)
 
-    def publish_observations(self, robots: range | list[int]) -> None:
-        """The current step's observations (once more) to some robots."""
-        for robot in robots:
-            self._obs_pubs[robot].publish(self._observations.messages[robot])
+    def _observe(self, session: Session) -> None:
+        self._observations.fill(session)
+        self._obs_pub.publish(list(enumerate(self._observations.messages)))
+
+    def observe_again(self, robots: list[int]) -> None:
+        """The current step's observations once more to some robots."""
+        self._obs_pub.publish_alone([(i, self._observations.messages[i]) for i in robots])
 
     def publish_diagnostics(self, decided: Decisions | NewestCommands, session: Session) -> None:
         """Stamped with wall time: it is about processes, not about the simulated world."""

@@ -48,6 +48,7 @@ operations = st.lists(
     st.one_of(
         st.tuples(st.just("plan"), st.lists(faults, max_size=4)),
         st.tuples(st.just("step"), st.permutations(range(ROBOTS))),
+        st.tuples(st.just("together"), st.none()),
         st.tuples(st.just("one"), st.integers(0, ROBOTS - 1)),
         st.tuples(st.just("again"), st.integers(0, ROBOTS - 1)),
         st.tuples(st.just("episode"), st.booleans()),
@@ -95,6 +96,25 @@ def test_effects_equal_the_plan_and_a_clear_or_a_lapse_lets_everything_pass(
     lockstep: bool, relays: bool, played: list[tuple[str, object]], by_lease: bool
 ) -> None:
     check(lockstep, relays, played, by_lease)
+
+
+def test_steps_without_faults_are_taken_at_once_and_remembered() -> None:
+    freeze = Fault(1, "freeze", 4, 2, (), Trigger(), 0)
+    run = Run(lockstep=True, relays=False)
+    played: list[tuple[str, object]] = [
+        ("plan", []), ("step", [*range(ROBOTS)]), *[("together", None)] * 3, ("again", 1),
+        ("together", None), ("plan", [freeze]), *[("together", None)] * 3,
+    ]  # fmt: skip
+    for operation, argument in played:
+        run.play(operation, argument)
+    assert run.wholes == 4
+    assert run.steps == [8] * ROBOTS
+    assert run.decided[0, 5, 1].mode == "freeze"
+    # The last command before the fault was taken with the rest of its step.
+    assert run.decided[0, 5, 1].applied == run.decided[0, 4, 1].applied
+    last = run.gate.last(2)
+    assert last is not None
+    assert last.command.key == (0, 7)
 
 
 @pytest.mark.soak

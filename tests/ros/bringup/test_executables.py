@@ -70,6 +70,9 @@ def test_each_executable_runs_appears_in_the_graph_and_ends_on_sigint(
             client.until(
                 lambda: expected <= set(client.node.get_node_names()), 20, f"{expected} to appear"
             )
+            states: list[EpisodeState] = []
+            client.node.create_subscription(EpisodeState, "/sim/episode", states.append, 1)
+            client.until(lambda: len(states) > 0, 20, "the first step")
         for child in children.values():
             child.send_signal(signal.SIGINT)
         for name, child in children.items():
@@ -78,9 +81,12 @@ def test_each_executable_runs_appears_in_the_graph_and_ends_on_sigint(
         for child in children.values():
             child.kill()
             child.wait(timeout=10)
-    assert {
-        name: (child.returncode, said[name]) for name, child in children.items()
-    } == dict.fromkeys(expected, (0, ""))
+    assert {name: child.returncode for name, child in children.items()} == dict.fromkeys(
+        expected, 0
+    )
+    for name, text in said.items():
+        (line,) = text.splitlines()
+        assert re.fullmatch(r"\[INFO\] \[[\d.]+\] \[" + name + r"\]: ready: [^<>]+", line), text
 
 
 @pytest.mark.skipif("rviz2" in get_packages_with_prefixes(), reason="RViz is installed here")

@@ -23,6 +23,7 @@ from fault_files import (
 
 from crash_coach_bringup.ros.evaluation import evaluate_via_ros
 from crash_coach_bringup.ros.graph import Layout
+from crash_coach_pkg.coach.config import TeamSpec
 from crash_coach_pkg.coach.fault_scenario import ScenarioPlanner, load_fault_scenario
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.play.conditions import Condition, Planned, at_rate, crash_free, named
@@ -60,7 +61,8 @@ def in_core(
     if isinstance(condition, Condition):
         return evaluate(load_policy(checkpoint), scenario, condition, episodes, SEED, effects=True)
     faults = load_fault_scenario(condition)
-    planned = Planned(condition.stem, lambda team, seed: ScenarioPlanner(faults, team, seed))
+    draws = ScenarioPlanner(faults, TeamSpec.of(make_env(scenario, 1).spec), SEED).draws
+    planned = Planned(condition.stem, lambda team, seed: ScenarioPlanner(faults, team, seed), draws)
     return evaluate(load_policy(checkpoint), scenario, planned, episodes, SEED, effects=True)
 
 

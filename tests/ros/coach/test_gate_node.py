@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import time
 
@@ -118,7 +119,8 @@ def test_signals_end_it_cleanly(ros_env: dict[str, str], name: str, number: int)
         t.meet(gate=name == "gate", coach=name == "coach")
         child.send_signal(number)
         _, errors = child.communicate(timeout=WAIT_S)
-        assert (child.returncode, errors) == (0, "")
+        assert child.returncode == 0
+        assert re.fullmatch(r"\[INFO\] \[[\d.]+\] \[" + name + r"\]: ready: .+\n", errors)
 
 
 @pytest.mark.parametrize(

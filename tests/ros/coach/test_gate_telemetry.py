@@ -254,6 +254,26 @@ def test_observations_are_relayed_changed_and_repeated(ros_env: dict[str, str]) 
         assert len(events(g, FaultEvent.EFFECT)) == 1
 
 
+def test_observation_faults_are_refused_at_once_where_no_gate_relays_observations(
+    ros_env: dict[str, str],
+) -> None:
+    with graph(ros_env) as g:
+        g.team.step(0, 0)
+        # The gate would be asked with the next episode only.
+        reason = g.operator.set(victims=["robot_1"], crash_mode="blind", apply_at="next_episode")
+        assert "fault blind changes observations, which this gate does not relay" in reason
+        assert g.operator.get("crash_mode", "victims") == ["mute", ["none"]]
+        assert not any(outcome.faulted for outcome in g.team.step(1, 0))
+        assert FaultEvent.REFUSED not in g.team.kinds()
+
+
+def test_observation_faults_are_taken_where_the_gate_relays_observations(
+    ros_env: dict[str, str],
+) -> None:
+    with graph(ros_env, gate={"relay_observations": True}) as g:
+        assert not g.operator.set(victims=["robot_1"], crash_mode="blind")
+
+
 @pytest.mark.parametrize("mode", ["blind", "bias"])
 def test_the_coach_hands_on_why_a_plan_was_refused(ros_env: dict[str, str], mode: str) -> None:
     with graph(ros_env) as g:

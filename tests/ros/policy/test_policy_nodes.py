@@ -196,7 +196,9 @@ def test_an_observation_of_another_size_ends_the_policy(
         bench.publish("robot_1", Sensed(0, 0, -1, features, ALL, ""))
         said, _ = child.communicate(timeout=10)
         assert child.returncode == 1
-        assert said == "policy: error: observation of robot_1: expected 6 features, got 8\n"
+        ready, error = said.splitlines()
+        assert ready.endswith("[policy_robot_1]: ready: acts for robot_1")
+        assert error == "policy: error: observation of robot_1: expected 6 features, got 8"
 
 
 @pytest.mark.parametrize(

@@ -214,13 +214,12 @@ def lost_after_s(options: UpOptions, dt_s: float) -> float:
     return LOST_STEPS * dt_s / factor
 
 
-def graph_nodes(options: UpOptions, team: TeamSpec) -> list[Node]:
-    """The graph's nodes, the sim last: the others are ready to answer when it starts.
-
-    Raises:
-        UserError: as relays_observations and placed.
-    """
-    acting: dict[str, Value] = {"command_topic": "command_raw" if options.gate else "command"}
+def _acting(options: UpOptions) -> dict[str, Value]:
+    """What all policy nodes of a graph have in common."""
+    acting: dict[str, Value] = {
+        "command_topic": "command_raw" if options.gate else "command",
+        "lockstep": options.mode == "lockstep",
+    }
     if options.checkpoint is None:
         acting["live"] = True
     else:
@@ -229,6 +228,16 @@ def graph_nodes(options: UpOptions, team: TeamSpec) -> list[Node]:
         else:
             acting |= {"checkpoint": str(options.checkpoint), "scenario": options.scenario}
         acting |= {"epsilon": float(options.epsilon), "exploration_seed": options.seed}
+    return acting
+
+
+def graph_nodes(options: UpOptions, team: TeamSpec) -> list[Node]:
+    """The graph's nodes, the sim last: the others are ready to answer when it starts.
+
+    Raises:
+        UserError: as relays_observations and placed.
+    """
+    acting = _acting(options)
     relays = relays_observations(options)
     if relays:
         acting["observation_topic"] = "observation_seen"
@@ -311,5 +320,5 @@ def single_process(nodes: Sequence[Node]) -> Process:
         start = namespace_rule(node.namespace)
         arguments += ros_arguments(start, f"{node.name}:", node.parameters)
     arguments += ros_arguments([], "", {}, nodes[0].common())
-    module = "crash_coach_bringup.ros.single"
-    return Process("graph", (sys.executable, "-m", module, *arguments))
+    module = ("-m", "crash_coach_common.executable", "crash_coach_bringup.ros.single")
+    return Process("graph", (sys.executable, *module, *arguments))

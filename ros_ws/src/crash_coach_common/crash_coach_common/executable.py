@@ -1,0 +1,34 @@
+"""Starts executables: ready for signals before anything else is loaded.
+
+Also ``python -m crash_coach_common.executable MODULE ...``, for one without a script of its own.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import sys
+from types import FrameType
+from typing import NoReturn
+
+
+def run(module: str) -> int:
+    """Loads ``module``, which takes its second or two, and calls its ``main``.
+
+    Meanwhile SIGINT and SIGTERM end the process at once, with exit code 0 and without a word, as
+    they do later: nothing is begun yet that had to be ended in order.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
+            signal.signal(number, _leave)
+    result: int = importlib.import_module(module).main()
+    return result
+
+
+def _leave(number: int, frame: FrameType | None) -> NoReturn:
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    sys.exit(run(sys.argv.pop(1)))

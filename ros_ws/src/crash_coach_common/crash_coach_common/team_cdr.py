@@ -1,0 +1,169 @@
+"""Serialized messages of several robots as one: TeamAction and TeamObservation.
+
+Each robot's message stands in it as on the robot's own topic, behind the names of all of them, so
+that no part of it need be looked at. Alignment is 4 throughout.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterable, Sequence
+
+from crash_coach_common.cdr import (
+    COMMANDED,
+    COUNT,
+    ENCAPSULATION_SIZE,
+    LITTLE_ENDIAN,
+    OBSERVED,
+    cut_short,
+)
+from crash_coach_common.contract import UserError
+
+_STAMP_SIZE = 8
+_ENCAPSULATION = LITTLE_ENDIAN + bytes(2)
+RobotMessage = tuple[int, bytes]  # a robot's index, and its own serialized message
+
+
+def _aligned(size: int) -> int:
+    return size + 3 & ~3
+
+
+def _behind_header(data: bytes, at: int) -> int:
+    (length,) = COUNT.unpack_from(data, at + _STAMP_SIZE)
+    behind: int = at + _STAMP_SIZE + COUNT.size + _aligned(length)
+    return behind
+
+
+def action_end(data: bytes, at: int) -> int:
+    """Where the Action that begins at ``at`` ends."""
+    return _behind_header(data, at) + COMMANDED.size
+
+
+def observation_end(data: bytes, at: int) -> int:
+    """Where the Observation that begins at ``at`` ends."""
+    at = _behind_header(data, at) + OBSERVED.size
+    (n_features,) = COUNT.unpack_from(data, at)
+    at += COUNT.size + 4 * n_features
+    (n_actions,) = COUNT.unpack_from(data, at)
+    end: int = at + COUNT.size + n_actions
+    return end
+
+
+def common_step(data: bytes, at: int, count: int) -> tuple[int, int] | None:
+    """(episode, step) of ``count`` Actions that begin at ``at``, where they have it in common with
+    the whole header, and none claims a fault; None otherwise."""
+    try:
+        body = _behind_header(data, at)
+        episode, step, _, _, _ = COMMANDED.unpack_from(data, body)
+    except struct.error:
+        return None
+    size = body - at + COMMANDED.size
+    stride = _aligned(size)
+    end = at + stride * (count - 1) + size
+    if not end <= len(data) <= _aligned(end):
+        return None
+    head = data[at : body + 2 * COUNT.size]
+    for start in range(at + stride, end, stride):
+        if not data.startswith(head, start):
+            return None
+    faults = data[body + COMMANDED.size - 1 : end : stride]
+    return (episode, step) if faults == bytes(count) else None
+
+
+class TeamCodec:
+    """Joins and splits the messages of ``robots``.
+
+    Args:
+        what: what the messages are called in errors.
+        end: where a robot's message ends, of those that begin at an offset.
+    """
+
+    def __init__(self, what: str, robots: Sequence[str], end: Callable[[bytes, int], int]) -> None:
+        self._what = what
+        self._robots = tuple(robots)
+        self._all: list[int | None] = list(range(len(robots)))
+        self._index = {name: index for index, name in enumerate(robots)}
+        self._end = end
+        self._written: dict[tuple[int, ...], bytes] = {}  # what stands before some robots' messages
+        self._read: tuple[bytes, list[int | None]] = (b"", [])
+
+    def join(self, messages: Sequence[RobotMessage]) -> bytes:
+        """One message of several, each with its robot."""
+        robots = tuple(robot for robot, _ in messages)
+        head = self._written.get(robots)
+        if head is None:
+            names = _names(self._robots[robot] for robot in robots)
+            head = self._written[robots] = _ENCAPSULATION + names + COUNT.pack(len(robots))
+        parts = [head]
+        for _, data in messages:
+            parts.append(data[ENCAPSULATION_SIZE:])
+            parts.append(bytes(-len(data) & 3))
+        return b"".join(parts)
+
+    def split(self, data: bytes) -> list[RobotMessage]:
+        """The messages of those robots that are ours.
+
+        Raises:
+            UserError: not little-endian CDR, cut short, or not one message for each name.
+        """
+        if data[:2] != LITTLE_ENDIAN:
+            raise UserError(
+                f"{self._what}: encapsulation {data[:2].hex()} is not little-endian CDR"
+            )
+        found: list[RobotMessage] = []
+        try:
+            robots, end = self._robots_of(data)
+            for robot in robots:
+                at = _aligned(end)
+                end = self._end(data, at)
+                if robot is not None:
+                    found.append((robot, _ENCAPSULATION + data[at:end]))
+        except (struct.error, UnicodeDecodeError) as error:
+            raise cut_short(self._what, data, error) from error
+        if end > len(data):
+            raise UserError(f"{self._what} of {len(data)} bytes is cut short")
+        return found
+
+    def begin_of_all(self, data: bytes) -> int | None:
+        """Where the messages begin in one of all robots, in their order; None for any other."""
+        try:
+            robots, at = self._robots_of(data)
+        except (UserError, struct.error, UnicodeDecodeError):
+            return None  # for ``split`` to say what is wrong
+        return at if robots == self._all and data[:2] == LITTLE_ENDIAN else None
+
+    def _robots_of(self, data: bytes) -> tuple[list[int | None], int]:
+        """Whose messages these are (None: nobody's of ours), and where their number ends."""
+        names, robots = self._read
+        if not names or not data.startswith(names, ENCAPSULATION_SIZE):
+            found, end = _names_of(data, ENCAPSULATION_SIZE)
+            robots = [self._index.get(name) for name in found]
+            names = data[ENCAPSULATION_SIZE:end]
+            self._read = names, robots
+        end = ENCAPSULATION_SIZE + len(names)
+        (count,) = COUNT.unpack_from(data, end)
+        if count != len(robots):
+            raise UserError(f"{self._what}: {count} messages for {len(robots)} robots")
+        return robots, end + COUNT.size
+
+
+def _names(names: Iterable[str]) -> bytes:
+    """string[], padded."""
+    encoded = [name.encode() + b"\0" for name in names]
+    parts = [COUNT.pack(len(encoded))]
+    for text in encoded:
+        parts += [COUNT.pack(len(text)), text, bytes(-len(text) & 3)]
+    return b"".join(parts)
+
+
+def _names_of(data: bytes, at: int) -> tuple[list[str], int]:
+    """A string[] and where it ends, padded."""
+    (count,) = COUNT.unpack_from(data, at)
+    at += COUNT.size
+    names = []
+    for _ in range(count):
+        (length,) = COUNT.unpack_from(data, at)
+        at += COUNT.size
+        names.append(data[at : at + length].rstrip(b"\0").decode())
+        at += _aligned(length)
+    return names, at
