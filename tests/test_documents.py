@@ -191,6 +191,13 @@ def test_train_and_evaluate(folder: Path, env: dict[str, str]) -> None:
     assert (folder / "runs" / "mine.json").exists()
 
 
+def test_trained_teams_are_there(folder: Path, env: dict[str, str]) -> None:
+    (teams,) = [lines for lines in blocks() if " results/" in lines[0]]
+    output = typed(folder, [". ./env.sh", *teams], env)
+    assert "wrote runs/3m.mp4" in output
+    assert "wrote runs/exported/policy.onnx" in output
+
+
 def node_by_node() -> list[str]:
     """The README's commands: gate, coach, team, sim."""
     commands = [line for lines in blocks() for line in lines if line.startswith("ros2 run")]
@@ -227,6 +234,7 @@ def test_no_block_is_left_out() -> None:
         ". ./env.sh",
         "ros2 param set /coach enabled true",
         "crash-coach doctor",
+        "crash-coach evaluate results/recipe/robust_openblas/robust-s0 --episodes 4 --each-robot",
         f"source {DISTRIBUTION}",
         'ros2 run crash_coach_pkg gate --ros-args -p robots:="[robot_1, robot_2]"',
     ]

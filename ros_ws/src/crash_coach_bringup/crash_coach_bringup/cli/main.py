@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import os
 import signal
 import sys
-from typing import Any, NoReturn
+from importlib.metadata import version
+from typing import Annotated, Any, NoReturn
 
 import typer
 
@@ -51,24 +53,55 @@ def make_app(verb: str | None = None) -> typer.Typer:
         name="crash-coach",
         help="Crash robots of a team on purpose: see what it costs, train it away.",
         no_args_is_help=True,
-        add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
-        callback=lambda: None,  # with a single verb, too, the verb has to be typed
+        callback=_options,  # with a single verb, too, the verb has to be typed
     )
     for name in VERBS if verb is None else (verb,):
         module, _, attribute = VERBS[name].partition(":")
         found: Any = getattr(importlib.import_module(module), attribute)
         if isinstance(found, typer.Typer):
-            app.add_typer(found, name=name)
+            for inner in found.registered_commands:
+                inner.short_help = _uncut(inner.callback)
+            app.add_typer(found, name=name, short_help=found.info.help)
         else:
-            app.command(name)(found)
+            app.command(name, short_help=_uncut(found))(found)
     return app
+
+
+def _tell_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"crash-coach {version('crash_coach_bringup')}")
+        raise typer.Exit
+
+
+def _options(
+    asked: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_tell_version, is_eager=True, help="Tell the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """What the command takes before a verb."""
+
+
+def _uncut(verb: Any) -> str:
+    """The first paragraph of a verb's help: lists of verbs would cut it to one line."""
+    return " ".join((inspect.getdoc(verb) or "").partition("\n\n")[0].split())
 
 
 def typed_app(arguments: list[str]) -> typer.Typer:
     """The command for a command line: with the verb that it begins with, otherwise with all."""
     return make_app(arguments[0] if arguments and arguments[0] in VERBS else None)
+
+
+def words_typed() -> list[str]:
+    """The command line; where a shell asks for its completion, the one that is to be completed."""
+    asked = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS")
+    if "_CRASH_COACH_COMPLETE" in os.environ and asked:
+        return asked.split()[1:]
+    return sys.argv[1:]
 
 
 def repeat_options(arguments: list[str], app: typer.Typer | None = None) -> list[str]:
@@ -82,7 +115,7 @@ def main() -> None:
         os.environ.setdefault(name, "1")
     degrade_characters()
     try:
-        app = typed_app(sys.argv[1:])  # loads libraries: a signal still ends it at once
+        app = typed_app(words_typed())  # loads libraries: a signal still ends it at once
         with signals.raised():
             app(args=repeat_options(sys.argv[1:], app))
     except UserError as error:
