@@ -37,7 +37,7 @@ EVENTS = QoSProfile(depth=1000)
 Key = tuple[int, int]
 
 
-def executable(name: str, package: str = "crash_coach_pkg") -> str:
+def executable(name: str, package: str) -> str:
     return str(Path(get_package_prefix(package)) / "lib" / package / name)
 
 
@@ -86,7 +86,7 @@ def run_to_end(
 ) -> tuple[int, str]:
     """Exit code and stderr of an executable that ends by itself."""
     done = subprocess.run(
-        [executable(name), *arguments(**parameters), *remapped(rules)],
+        [executable(name, "crash_coach_pkg"), *arguments(**parameters), *remapped(rules)],
         env=env,
         text=True,
         stderr=subprocess.PIPE,

@@ -1,43 +1,57 @@
-"""Gate and coach alone: without simulator and policies, without pymunk, torch and numba."""
+"""Gate and coach alone, in an environment of ROS, numpy and their own package: no simulator, no
+policies, no pymunk, torch and numba."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
-from coach_graph import graph, process, run_to_end
+import bare_environment
+import coach_graph
+import pytest
+from coach_graph import graph, run_to_end
 
-BLOCKED = ("sim_pkg", "policy_pkg", "crash_coach_bringup", "pymunk", "torch", "numba")
-CUSTOMIZE = f"""
-import sys
+ABSENT = ("sim_pkg", "policy_pkg", "crash_coach_bringup", "pymunk", "torch", "numba")
+NEEDED = ("numpy", "pydantic", "pyyaml", "ros-diagnostic-msgs", "ros-std-srvs")
 
-
-class Bare:
-    def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in {BLOCKED!r}:
-            raise ModuleNotFoundError(f"not installed here: {{name}}")
+pytestmark = bare_environment.needs_wheels
 
 
-sys.meta_path.insert(0, Bare())
-"""
+@pytest.fixture(scope="module")
+def venv(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    ours = dict.fromkeys(("ros_ws/src/crash_coach_common", "crash_coach_pkg"), "")
+    return bare_environment.make(tmp_path_factory.mktemp("bare"), ours, *NEEDED)
 
 
-def bare(env: dict[str, str], folder: Path) -> dict[str, str]:
-    """An environment in which these cannot be imported, in no process."""
-    (folder / "sitecustomize.py").write_text(CUSTOMIZE)
-    return {**env, "PYTHONPATH": os.pathsep.join((str(folder), env.get("PYTHONPATH", "")))}
+@pytest.fixture
+def bare(venv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gate and coach are those of the bare environment."""
+
+    def executable(name: str, package: str) -> str:
+        assert package == "crash_coach_pkg"
+        return str(bare_environment.program(venv, name, tmp_path))
+
+    monkeypatch.setattr(coach_graph, "executable", executable)
 
 
-def test_faults_reach_the_robots(ros_env: dict[str, str], tmp_path: Path) -> None:
-    with graph(bare(ros_env, tmp_path), victims=("robot_2",), start_step=2) as g:
+def test_nothing_else_is_there(venv: Path) -> None:
+    assert bare_environment.found(venv, *ABSENT, "numpy", "crash_coach_pkg") == [
+        "numpy",
+        "crash_coach_pkg",
+    ]
+
+
+@pytest.mark.usefixtures("bare")
+def test_faults_reach_the_robots(ros_env: dict[str, str]) -> None:
+    with graph(ros_env, victims=("robot_2",), start_step=2) as g:
         faulted = [[each.faulted for each in g.team.step(0, step)] for step in range(5)]
     assert faulted == [[False] * 3] * 2 + [[False, True, False]] * 3
 
 
-def test_twist_commands_too(ros_env: dict[str, str], tmp_path: Path) -> None:
+@pytest.mark.usefixtures("bare")
+def test_twist_commands_too(ros_env: dict[str, str]) -> None:
     """The gate of other types: it refuses a type by looking at it, so it got as far as that."""
     code, said = run_to_end(
-        bare(ros_env, tmp_path),
+        ros_env,
         "gate",
         robots=("rover_1",),
         command_type="geometry_msgs/msg/Twisted",
@@ -47,11 +61,3 @@ def test_twist_commands_too(ros_env: dict[str, str], tmp_path: Path) -> None:
     )
     assert code == 1
     assert "Twisted" in said
-    assert "not installed here" not in said
-
-
-def test_the_wall_is_there(ros_env: dict[str, str], tmp_path: Path) -> None:
-    with process(bare(ros_env, tmp_path), "sim", "sim_pkg", scenario="buttons") as sim:
-        _, said = sim.communicate(timeout=250)
-    assert sim.returncode != 0
-    assert "not installed here" in said
