@@ -21,10 +21,13 @@ setup(
     package_data={"crash_coach_pkg": ["configs/**/*.yaml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
-        (f"share/{package}", ["package.xml"]),
+        (f"share/{package}", ["package.xml", "LICENSE"]),
     ],
     install_requires=["setuptools"],
-    extras_require={"wrappers": ["numpy", "pydantic", "pettingzoo", "gymnasium"]},
+    extras_require={
+        "test": ["pytest"],
+        "wrappers": ["numpy", "pydantic", "pettingzoo", "gymnasium"],
+    },
     zip_safe=False,
     entry_points={
         "console_scripts": [

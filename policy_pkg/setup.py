@@ -34,11 +34,11 @@ setup(
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
-        (f"share/{package}", ["package.xml"]),
+        (f"share/{package}", ["package.xml", "LICENSE"]),
     ],
     install_requires=["setuptools"],
     # What a policy node or a program of one's own acts with; rclpy comes with ROS.
-    extras_require={"acting": ["numpy", "pydantic", "safetensors"]},
+    extras_require={"test": ["pytest"], "acting": ["numpy", "pydantic", "safetensors"]},
     zip_safe=False,
     entry_points={
         "console_scripts": [

@@ -33,6 +33,7 @@ LOCK = ROOT / "requirements.lock"
 
 UV_VERSION = "0.13.9"
 OLDEST, NEWEST = (3, 11), (3, 14)
+JAZZY = (3, 12)  # what a Jazzy distribution's rclpy is compiled for
 DISK_BYTES = 8 * 10**9  # torch for x86-64 alone unpacks to about 6 GB
 
 # The ROS wheels export CMake files that name the machine they were built on.
@@ -93,8 +94,9 @@ def version_of(python: str) -> tuple[int, int] | None:
     return int(major), int(minor)
 
 
-def find_python() -> str:
-    """An interpreter of a supported version; $PYTHON first, then python3, then python3.x."""
+def find_python(ros: str) -> str:
+    """An interpreter that ``ros`` takes; $PYTHON first, then python3, then python3.x."""
+    oldest, newest = (JAZZY, JAZZY) if ros == "distribution" else (OLDEST, NEWEST)
     asked = os.environ.get("PYTHON")
     names = (
         [asked] if asked else ["python3", "python3.12", "python3.13", "python3.11", "python3.14"]
@@ -104,11 +106,15 @@ def find_python() -> str:
         version = version_of(name)
         if version is None:
             continue
-        if OLDEST <= version <= NEWEST:
+        if oldest <= version <= newest:
             return name
         found.append(f"{name} is {version[0]}.{version[1]}")
+    wanted = f"{oldest[0]}.{oldest[1]}"
+    if oldest != newest:
+        wanted += f" to {newest[0]}.{newest[1]}"
+    why = ", which the sourced Jazzy distribution is built for," if ros == "distribution" else ""
     raise SetupError(
-        f"no Python {OLDEST[0]}.{OLDEST[1]} to {NEWEST[0]}.{NEWEST[1]} found "
+        f"no Python {wanted}{why} found "
         f"({'; '.join(found) or 'none of ' + ', '.join(names) + ' runs'}): "
         "install one, or name it: make setup PYTHON=/path/to/python3.12"
     )
@@ -250,7 +256,7 @@ def main() -> int:
         check_machine()
         with open(ROOT / ".setup.lock", "w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            python = find_python()
+            python = find_python(ros)
             base = fingerprint([str(ROOT), str(version_of(python)), UV_VERSION, ros])
             stage("venv", "virtual environment", base, lambda: make_venv(python))
             packages = fingerprint([base, LOCK])

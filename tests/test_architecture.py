@@ -27,7 +27,7 @@ PACKAGES = {
 JOINING = {"bags", "play", "report", "sweep", "train"}
 MESSAGES = {
     "rclpy", "crash_coach_interfaces", "std_msgs", "geometry_msgs", "nav_msgs", "std_srvs",
-    "visualization_msgs", "diagnostic_msgs", "rosgraph_msgs", "rcl_interfaces",
+    "visualization_msgs", "diagnostic_msgs", "rosgraph_msgs", "rcl_interfaces", "tf2_msgs",
     "builtin_interfaces", "ament_index_python",
 }  # fmt: skip
 TORCHSCRIPT = ("export", "torchscript.py")

@@ -64,11 +64,28 @@ def test_an_old_python_is_refused_with_its_version(
     old.write_text("#!/bin/sh\necho 3 9\n")
     old.chmod(0o755)
     monkeypatch.setenv("PYTHON", str(old))
-    with pytest.raises(setup.SetupError, match=r"old_python is 3\.9"):
-        setup.find_python()
+    with pytest.raises(setup.SetupError, match=r"no Python 3\.11 to 3\.14 found .*is 3\.9"):
+        setup.find_python("wheels")
     monkeypatch.setenv("PYTHON", str(tmp_path / "none"))
     with pytest.raises(setup.SetupError, match="none runs"):
-        setup.find_python()
+        setup.find_python("wheels")
+
+
+@pytest.mark.parametrize(("version", "fits"), [("3 11", False), ("3 12", True), ("3 13", False)])
+def test_a_distribution_takes_the_python_that_it_is_built_for(
+    setup: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, version: str, fits: bool
+) -> None:
+    python = tmp_path / "some_python"
+    python.write_text(f"#!/bin/sh\necho {version}\n")
+    python.chmod(0o755)
+    monkeypatch.setenv("PYTHON", str(python))
+    assert setup.find_python("wheels") == str(python)
+    if fits:
+        assert setup.find_python("distribution") == str(python)
+        return
+    reason = r"no Python 3\.12, which the sourced Jazzy distribution is built for, found"
+    with pytest.raises(setup.SetupError, match=reason):
+        setup.find_python("distribution")
 
 
 def test_an_interrupted_stage_is_done_again(setup: ModuleType) -> None:

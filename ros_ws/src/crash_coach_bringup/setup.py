@@ -22,12 +22,13 @@ setup(
     package_data={},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
-        (f"share/{package}", ["package.xml"]),
+        (f"share/{package}", ["package.xml", "LICENSE"]),
         (f"share/{package}/launch", glob("launch/*.launch.py")),
         (f"share/{package}/rviz", glob("rviz/*.rviz")),
         (f"share/{package}/config", glob("config/*")),
     ],
     install_requires=["setuptools"],
+    extras_require={"test": ["pytest"]},
     zip_safe=False,
     entry_points={
         "console_scripts": [

@@ -22,6 +22,7 @@ from sim_pkg.lockstep import Decisions
 from sim_pkg.realtime import NewestCommands
 from sim_pkg.ros import convert
 from sim_pkg.ros.arena_view import ArenaView
+from sim_pkg.ros.transforms import Transforms
 from sim_pkg.session import Session
 
 EPISODE_TOPIC = "sim/episode"
@@ -77,14 +78,16 @@ class SimTopics:
             node, COMMANDS, spec.robots, commanded, "command", on_commands, on_error, lockstep
         )
         node.create_subscription(FaultEvent, EVENTS_TOPIC, on_event, _reliable(100))
+        self._transforms = Transforms(node, spec.robots, convert.MAP_FRAME)
         self._draw = False
         self._odom: list[int] = []
 
     def refresh_listeners(self) -> None:
-        """Notes who listens to what is built on demand only (odometry, markers)."""
+        """Notes who listens to what is built on demand only (odometry, TF, markers)."""
         self._draw = self._markers_pub.get_subscription_count() > 0
         self._arena.refresh_listeners()
         self._obs_pub.look()
+        self._transforms.refresh_listeners()
         self._odom = [
             i for i, pub in enumerate(self._odom_pubs) if pub.get_subscription_count() > 0
         ]
@@ -115,6 +118,7 @@ class SimTopics:
             if session.running:
                 self._observe(session)
         self._arena.look(session, self._header)
+        self._transforms.look(session, self._header)
         if self._draw:
             self._markers_pub.publish(convert.markers(session, self._header))
         for robot in self._odom:
