@@ -50,7 +50,7 @@ def place(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def typed(place: Path, *words: str) -> subprocess.CompletedProcess[str]:
+def typed(place: Path, *words: str, timeout_s: float = 110) -> subprocess.CompletedProcess[str]:
     kept = {*FOLDERS, "XDG_CACHE_HOME", "XDG_CONFIG_HOME", "ROS_HOME", "PYTHONDONTWRITEBYTECODE"}
     env = {name: value for name, value in os.environ.items() if name not in kept}
     env |= {"HOME": str(ROOT / "docs"), "TMPDIR": str(place / "tmp")}
@@ -58,7 +58,7 @@ def typed(place: Path, *words: str) -> subprocess.CompletedProcess[str]:
         env["ROS_DOMAIN_ID"] = str(domain)
         return subprocess.run(
             mounted(COMMAND, *words),
-            cwd=place, env=env, capture_output=True, text=True, timeout=110, check=False,
+            cwd=place, env=env, capture_output=True, text=True, timeout=timeout_s, check=False,
         )  # fmt: skip
 
 
@@ -83,9 +83,10 @@ def test_a_graph_runs(place: Path) -> None:
     assert not [text for text in logs.values() if "Traceback" in text or "rror" in text]
 
 
+@pytest.mark.soak  # all that a training compiles, without a cache
 def test_a_team_is_trained(place: Path) -> None:
     size = ("total_steps=200", "test_interval_steps=100", "test_episodes=2")
-    done = typed(place, "train", "buttons/qmix", "--out", "run", "--set", *size)
+    done = typed(place, "train", "buttons/qmix", "--out", "run", "--set", *size, timeout_s=900)
     assert done.returncode == 0, done.stdout + done.stderr
     only_the_caches_are_told(place, done.stderr)
     assert list((place / "run").glob("**/step_*"))
