@@ -5,6 +5,7 @@ from __future__ import annotations
 import configparser
 import io
 import os
+import re
 import shlex
 import subprocess
 import tomllib
@@ -12,9 +13,30 @@ from pathlib import Path
 
 from crash_coach_bringup.ros.probe import find_executable
 
+ROOT = Path(__file__).resolve().parents[2]
 
-def install(folder: Path, path: str, source: str, project: str) -> None:
-    """What installing the project leaves: its module at ``path``, and what its metadata says."""
+
+class Page:
+    """A page of docs/ with one block per language: Python of the module at the path that follows
+    ``names``, toml of its project, and commands."""
+
+    def __init__(self, name: str, names: str) -> None:
+        self.text = (ROOT / "docs" / name).read_text()
+        self._names = names
+
+    def block(self, language: str) -> str:
+        """The page's only block in that language."""
+        (found,) = re.findall(rf"```{language}\n(.*?)```", self.text, flags=re.DOTALL)
+        return str(found)
+
+    def installed(self, folder: Path, project: str) -> Path:
+        """``folder``, with what installing the project leaves: its module and its metadata."""
+        (path,) = re.findall(rf"{self._names}, `(\S+\.py)`", self.text)
+        _install(folder, path, self.block("python"), project)
+        return folder
+
+
+def _install(folder: Path, path: str, source: str, project: str) -> None:
     module = folder / path
     module.parent.mkdir(parents=True)
     module.with_name("__init__.py").touch()

@@ -3,30 +3,17 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import pytest
-from page_package import crash_coach, install
+from page_package import Page, crash_coach
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs/adding_a_fault.md").read_text()
-
-
-def block(language: str) -> str:
-    """The page's only block in that language."""
-    (found,) = re.findall(rf"```{language}\n(.*?)```", PAGE, flags=re.DOTALL)
-    return str(found)
-
-
-def installed(folder: Path, project: str) -> Path:
-    (path,) = re.findall(r"The mode, `(\S+\.py)`", PAGE)
-    install(folder, path, block("python"), project)
-    return folder
+PAGE = Page("adding_a_fault.md", "The mode")
 
 
 @pytest.fixture(scope="module")
 def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return installed(tmp_path_factory.mktemp("site"), block("toml"))
+    return PAGE.installed(tmp_path_factory.mktemp("site"), PAGE.block("toml"))
 
 
 def hash_of(folder: Path, line: str, out: Path) -> str:
@@ -36,7 +23,7 @@ def hash_of(folder: Path, line: str, out: Path) -> str:
 
 
 def test_the_mode_works_as_the_page_says(package: Path, tmp_path: Path) -> None:
-    line = block("bash").strip()
+    line = PAGE.block("bash").strip()
     frozen = line.replace("--mode hiccup --param period=2", "--mode freeze")
     lines = line, line.replace("period=2", "period=1"), frozen
     as_written, each_step, freeze = (
@@ -47,14 +34,14 @@ def test_the_mode_works_as_the_page_says(package: Path, tmp_path: Path) -> None:
 
 
 def test_its_schema_is_checked(package: Path) -> None:
-    done = crash_coach(package, block("bash").strip().replace("period=2", "period=0"))
+    done = crash_coach(package, PAGE.block("bash").strip().replace("period=2", "period=0"))
     assert done.returncode != 0
     assert "hiccup: parameter period = 0" in " ".join(done.stderr.split())
     assert "Traceback" not in done.stderr
 
 
 def test_without_the_package_the_mode_is_unknown(tmp_path: Path) -> None:
-    done = crash_coach(tmp_path, block("bash").strip())
+    done = crash_coach(tmp_path, PAGE.block("bash").strip())
     assert done.returncode != 0
     assert "unknown crash mode 'hiccup'" in " ".join(done.stderr.split())
 
@@ -67,8 +54,8 @@ def test_without_the_package_the_mode_is_unknown(tmp_path: Path) -> None:
     ],
 )
 def test_a_broken_entry_point_is_named(tmp_path: Path, old: str, new: str, text: str) -> None:
-    site = installed(tmp_path / "site", block("toml").replace(old, new))
-    done = crash_coach(site, block("bash").strip())
+    site = PAGE.installed(tmp_path / "site", PAGE.block("toml").replace(old, new))
+    done = crash_coach(site, PAGE.block("bash").strip())
     assert done.returncode != 0
     said = " ".join(done.stderr.split())
     assert "entry point hiccup" in said

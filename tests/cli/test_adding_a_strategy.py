@@ -3,37 +3,24 @@
 from __future__ import annotations
 
 import json
-import re
 import shlex
 from pathlib import Path
 
 import pytest
-from page_package import crash_coach, install
+from page_package import Page, crash_coach
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs/adding_a_strategy.md").read_text()
+PAGE = Page("adding_a_strategy.md", "The strategy")
 RUN = "runs/weakest"
-
-
-def block(language: str) -> str:
-    """The page's only block in that language."""
-    (found,) = re.findall(rf"```{language}\n(.*?)```", PAGE, flags=re.DOTALL)
-    return str(found)
-
-
-def installed(folder: Path, project: str) -> Path:
-    (path,) = re.findall(r"The strategy, `(\S+\.py)`", PAGE)
-    install(folder, path, block("python"), project)
-    return folder
 
 
 @pytest.fixture(scope="module")
 def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return installed(tmp_path_factory.mktemp("site"), block("toml"))
+    return PAGE.installed(tmp_path_factory.mktemp("site"), PAGE.block("toml"))
 
 
 def test_the_strategy_trains_as_the_page_says(package: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    done = crash_coach(package, block("bash").strip().replace(RUN, shlex.quote(str(run))))
+    done = crash_coach(package, PAGE.block("bash").strip().replace(RUN, shlex.quote(str(run))))
     assert done.returncode == 0, done.stderr
     described = json.loads((run / "run.json").read_text())["config"]["coach"]
     assert (described["strategy"], described["weakest"]) == ("weakest", {"every": 3})
@@ -49,7 +36,7 @@ def test_the_strategy_trains_as_the_page_says(package: Path, tmp_path: Path) -> 
 
 
 def test_its_settings_are_checked(package: Path, tmp_path: Path) -> None:
-    line = block("bash").strip().replace(RUN, shlex.quote(str(tmp_path / "run")))
+    line = PAGE.block("bash").strip().replace(RUN, shlex.quote(str(tmp_path / "run")))
     for wrong, text in (
         ("every=0", "strategy weakest: setting every = 0: Input should be greater"),
         ("evry=3", "unknown setting 'evry' (did you mean 'every'?)"),
@@ -61,7 +48,7 @@ def test_its_settings_are_checked(package: Path, tmp_path: Path) -> None:
 
 
 def test_without_the_package_the_strategy_is_unknown(tmp_path: Path) -> None:
-    line = block("bash").strip().replace(RUN, shlex.quote(str(tmp_path / "run")))
+    line = PAGE.block("bash").strip().replace(RUN, shlex.quote(str(tmp_path / "run")))
     done = crash_coach(tmp_path, line)
     assert done.returncode != 0
     assert "unknown key 'weakest' of the coach" in " ".join(done.stderr.split())
@@ -75,8 +62,8 @@ def test_without_the_package_the_strategy_is_unknown(tmp_path: Path) -> None:
     ],
 )
 def test_a_broken_entry_point_is_named(tmp_path: Path, old: str, new: str, text: str) -> None:
-    site = installed(tmp_path / "site", block("toml").replace(old, new))
-    line = block("bash").strip().replace(RUN, shlex.quote(str(tmp_path / "run")))
+    site = PAGE.installed(tmp_path / "site", PAGE.block("toml").replace(old, new))
+    line = PAGE.block("bash").strip().replace(RUN, shlex.quote(str(tmp_path / "run")))
     done = crash_coach(site, line)
     assert done.returncode != 0
     said = " ".join(done.stderr.split())

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from importlib.metadata import entry_points
 
 from pydantic import ValidationError
 
 from crash_coach_common.contract import UserError
-from crash_coach_common.plugins import load, place
+from crash_coach_common.plugins import with_installed
 from crash_coach_common.wrong_key import did_you_mean
 from crash_coach_pkg.faults.adversarial import Adversarial
 from crash_coach_pkg.faults.base import (
@@ -83,17 +82,7 @@ def _check(mode: type[FaultMode], known: Mapping[str, type[FaultMode]]) -> None:
 def _known_modes() -> dict[str, type[FaultMode]]:
     global _installed_read
     if not _installed_read:
-        found = dict(_modes)
-        for point in entry_points(group=ENTRY_POINT_GROUP):
-            mode = load(point)
-            if mode in found.values():  # registered before
-                continue
-            try:
-                _check(mode, found)
-            except ValueError as error:
-                raise UserError(f"{place(point)} cannot be used: {error}") from error
-            found[mode.name] = mode
-        _modes.update(found)
+        _modes.update(with_installed(ENTRY_POINT_GROUP, _modes, _check))
         _installed_read = True
     return _modes
 

@@ -10,7 +10,7 @@ from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-UNKNOWN = "_NODE_NAME_UNKNOWN_"  # rmw's word
+from crash_coach_common.ros.peers import UNKNOWN, full_name
 
 
 class Endpoint(NamedTuple):
@@ -46,7 +46,7 @@ def strangers(node: Node, topic: str, type_name: str, listening: bool) -> tuple[
     )
     return tuple(
         sorted(
-            Stranger(_full_name(info), info.topic_type)
+            Stranger(full_name(info), info.topic_type)
             for info in found
             if info.topic_type != type_name
         )
@@ -79,14 +79,10 @@ def leaves_observations(node: Node) -> bool:
     return bool(gates) and "crash_coach_interfaces/msg/Observation" not in types
 
 
-def _full_name(info: Any) -> str:
-    return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
-
-
 def publishers_on(node: Node, topic: str) -> frozenset[Endpoint]:
     """Every publisher on ``topic`` that the graph knows of now."""
     return frozenset(
-        Endpoint(bytes(info.endpoint_gid).hex(), _full_name(info))
+        Endpoint(bytes(info.endpoint_gid).hex(), full_name(info))
         for info in node.get_publishers_info_by_topic(topic)
     )
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 Array = npt.NDArray[Any]
-_DTYPES = {"float32": torch.float32, "float64": torch.float64}
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
 class Linear(nn.Linear):
@@ -50,6 +50,6 @@ def _affine(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
 
 
 def _product(a: Array, b: Array) -> Tensor:
-    out = torch.empty((a.shape[0], b.shape[1]), dtype=_DTYPES[a.dtype.name])  # aligned, for BLAS
+    out = torch.empty((a.shape[0], b.shape[1]), dtype=DTYPES[a.dtype.name])  # aligned, for BLAS
     np.matmul(a, b, out=out.numpy())
     return out

@@ -19,7 +19,7 @@ BETAS = (0.9, 0.999)  # Adam's
 
 
 class UpdateRule(ABC):
-    """UpdateRule against ``tensor.grad``.
+    """Steps against ``tensor.grad``.
 
     ``state``: what is kept of earlier steps, by torch's names; empty before the first.
     """

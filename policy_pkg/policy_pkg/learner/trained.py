@@ -12,6 +12,7 @@ from torch import Tensor
 from crash_coach_common.contract import UserError
 from policy_pkg.episode import Sizes
 from policy_pkg.learner.config import LearnerConfig
+from policy_pkg.learner.layers import DTYPES
 from policy_pkg.learner.loss import Steps
 from policy_pkg.learner.nets import Nets, make_nets
 from policy_pkg.learner.optimiser import Optimiser, check_arrays
@@ -20,7 +21,6 @@ from policy_pkg.learner.replay import Batch
 Array = npt.NDArray[Any]
 Arrays = dict[str, Array]
 Scalars = dict[str, int | str]
-_DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
 class Trained:
@@ -47,7 +47,7 @@ class Trained:
             )
         self.config, self.sizes, self.algorithm = config, sizes, algorithm
         self._place: dict[str, Any] = {
-            "dtype": _DTYPES[np.dtype(dtype).name],
+            "dtype": DTYPES[np.dtype(dtype).name],
             "device": config.device,
         }
         self._online = make_nets(config, sizes, seed, mixing, **self._place)

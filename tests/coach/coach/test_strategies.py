@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from crash_coach_common import plugins
 from crash_coach_pkg.coach import strategies
 from crash_coach_pkg.coach.coach import Coach
 from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
@@ -191,7 +192,7 @@ def test_what_cannot_be_registered(changes: dict[str, Any], message: str) -> Non
 
 def test_an_installed_strategy_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     point = EntryPoint("theirs", f"{__name__}:Alternating", strategies.ENTRY_POINT_GROUP)
-    monkeypatch.setattr(strategies, "entry_points", lambda **_: (point,))
+    monkeypatch.setattr(plugins, "entry_points", lambda **_: (point,))
     monkeypatch.setattr(strategies, "_installed_read", False)
     monkeypatch.setattr(strategies, "_strategies", dict(strategies._strategies))
     coach = Coach(CoachConfig(strategy="alternating"), TEAM, seed=0)

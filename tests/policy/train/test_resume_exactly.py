@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,18 @@ class Stopped(Exception):
     pass
 
 
+def train_until(config: TrainConfig, run: Path, there: Callable[[ProgressReport], bool]) -> None:
+    """Trains, and is killed by surprise as soon as a report is ``there``."""
+
+    def stop(report: ProgressReport) -> None:
+        if there(report):
+            raise Stopped
+
+    ticks = iter(range(10**9))  # a clock on which every step is worth a report
+    with pytest.raises(Stopped):
+        train(config, run, progress=stop, clock=lambda: float(next(ticks)))
+
+
 @pytest.mark.parametrize(
     ("phase", "steps"),
     [("evaluation", 200), ("evaluation", 1000), ("checkpoint", 1200), ("training", 1705)],
@@ -88,14 +101,8 @@ class Stopped(Exception):
 def test_stopping_anywhere_and_resuming_changes_no_bit(
     whole: Path, tmp_path: Path, phase: Phase, steps: int
 ) -> None:
-    def stop(report: ProgressReport) -> None:
-        if report.phase == phase and report.steps >= steps:
-            raise Stopped
-
     run = tmp_path / "run"
-    ticks = iter(range(10**9))  # a clock on which every step is worth a report
-    with pytest.raises(Stopped):
-        train(CONFIG, run, progress=stop, clock=lambda: float(next(ticks)))
+    train_until(CONFIG, run, lambda report: report.phase == phase and report.steps >= steps)
     train(CONFIG, run, resume=True)
     assert_same_run(run, whole)
 
@@ -114,13 +121,7 @@ def test_faults_with_memory_go_on_where_they_were(tmp_path: Path) -> None:
     config = TrainConfig.model_validate(settings)
     train(config, tmp_path / "whole")
 
-    def stop(report: ProgressReport) -> None:
-        if report.steps >= 600:
-            raise Stopped
-
-    ticks = iter(range(10**9))
-    with pytest.raises(Stopped):
-        train(config, tmp_path / "run", progress=stop, clock=lambda: float(next(ticks)))
+    train_until(config, tmp_path / "run", lambda report: report.steps >= 600)
     assert read_manifest(find_checkpoint(tmp_path / "run")).progress["env_steps"] == 400
     train(config, tmp_path / "run", resume=True)
     assert_same_run(tmp_path / "run", tmp_path / "whole")
@@ -140,13 +141,7 @@ def test_a_strategys_state_goes_on_where_it_was(tmp_path: Path, strategy: str) -
     config = TrainConfig.model_validate(settings)
     train(config, tmp_path / "whole")
 
-    def stop(report: ProgressReport) -> None:
-        if report.steps >= 1005:
-            raise Stopped
-
-    ticks = iter(range(10**9))
-    with pytest.raises(Stopped):
-        train(config, tmp_path / "run", progress=stop, clock=lambda: float(next(ticks)))
+    train_until(config, tmp_path / "run", lambda report: report.steps >= 1005)
     manifest = read_manifest(find_checkpoint(tmp_path / "run"))
     assert manifest.progress["env_steps"] == 800
     saved = manifest.training["coach"]["strategy"]

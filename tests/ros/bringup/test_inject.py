@@ -164,7 +164,8 @@ def test_unknown_modes_and_parameters_are_named() -> None:
 
 
 def test_what_the_gate_cannot_do_is_refused_with_its_reason(untouched: Graph) -> None:
-    with pytest.raises(InjectError, match=r"the coach refused: the gate would refuse: .*obs"):
+    reason = r"the coach refused: the gate would refuse: .*observations"
+    with pytest.raises(InjectError, match=reason):
         inject(("robot_1",), "blind", domain=untouched.domain)
     assert crashed(untouched.episodes(1)) == {(0, 0)}
 

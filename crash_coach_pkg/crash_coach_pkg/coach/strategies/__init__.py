@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from importlib.metadata import entry_points
 from typing import Any
 
 from pydantic import ValidationError
 
 from crash_coach_common.contract import UserError
-from crash_coach_common.plugins import load, place
+from crash_coach_common.plugins import with_installed
 from crash_coach_common.wrong_key import Misplaced, did_you_mean
 from crash_coach_pkg.coach.strategies.adaptive import Adaptive
 from crash_coach_pkg.coach.strategies.base import Candidates, Strategy, StrategySettings
@@ -60,17 +59,7 @@ def _check(strategy: type[AnyStrategy], known: Mapping[str, type[AnyStrategy]]) 
 def _known() -> dict[str, type[AnyStrategy]]:
     global _installed_read
     if not _installed_read:
-        found = dict(_strategies)
-        for point in entry_points(group=ENTRY_POINT_GROUP):
-            strategy: type[AnyStrategy] = load(point)
-            if strategy in found.values():  # registered before
-                continue
-            try:
-                _check(strategy, found)
-            except ValueError as error:
-                raise UserError(f"{place(point)} cannot be used: {error}") from error
-            found[strategy.name] = strategy
-        _strategies.update(found)
+        _strategies.update(with_installed(ENTRY_POINT_GROUP, _strategies, _check))
         _installed_read = True
     return _strategies
 

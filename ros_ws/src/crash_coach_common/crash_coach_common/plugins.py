@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
@@ -22,6 +23,35 @@ def load(point: EntryPoint) -> Any:
 def place(point: EntryPoint) -> str:
     package = point.dist.name if point.dist is not None else "an unknown package"
     return f"entry point {point.name} = {point.value} ({point.group}) of {package}"
+
+
+def _accept(point: EntryPoint, check: Callable[[], None]) -> None:
+    """Raises UserError naming ``point`` and its package where ``check`` raises ValueError."""
+    try:
+        check()
+    except ValueError as error:
+        raise UserError(f"{place(point)} cannot be used: {error}") from error
+
+
+def with_installed(
+    group: str, known: Mapping[str, T], check: Callable[[T, Mapping[str, T]], None]
+) -> dict[str, T]:
+    """``known``, and after them what an entry point group names: each under its own ``name``.
+
+    Args:
+        check: raises ValueError where what was loaded cannot be used beside what is known so far.
+
+    Raises:
+        UserError: naming the entry point and its package.
+    """
+    found = dict(known)
+    for point in entry_points(group=group):
+        loaded: Any = load(point)
+        if loaded in found.values():  # registered before
+            continue
+        _accept(point, partial(check, loaded, found))
+        found[loaded.name] = loaded
+    return found
 
 
 class Plugins(Mapping[str, T]):
@@ -50,10 +80,7 @@ class Plugins(Mapping[str, T]):
         if name not in self._own:
             point = self._installed()[name]
             loaded = load(point)
-            try:
-                self._check(name, loaded)
-            except ValueError as error:
-                raise UserError(f"{place(point)} cannot be used: {error}") from error
+            _accept(point, partial(self._check, name, loaded))
             self._own[name] = loaded
         return self._own[name]
 

@@ -19,12 +19,12 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from crash_coach_common.contract import UserError
+from crash_coach_common.ros.peers import UNKNOWN, full_name
 from crash_coach_common.ros.qos import NEWEST
 from crash_coach_common.team_cdr import RobotMessage, TeamCodec, action_end, observation_end
 
 NAMESPACE = "_team"  # hidden: a bag of all topics then has the robots' own, as bags always had
 _LOOK_S = 1.0  # a node's name may come later than its subscriptions
-_UNKNOWN = "_NODE_NAME_UNKNOWN_"  # rmw's word
 
 
 @dataclass(frozen=True)
@@ -133,9 +133,7 @@ class TeamPublisher:
 
 def _name(info: Any) -> str | None:
     """Of a listener's node; None while it is not known."""
-    if info.node_name == _UNKNOWN:
-        return None
-    return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+    return None if info.node_name == UNKNOWN else full_name(info)
 
 
 def subscribe(
