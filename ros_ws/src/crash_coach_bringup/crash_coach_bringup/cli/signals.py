@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
+_AGAIN_S = 0.02
 WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 
 
@@ -43,16 +45,38 @@ def _leave(number: int, frame: FrameType | None) -> NoReturn:
 
 @contextmanager
 def raised() -> Iterator[None]:
-    """In the body SIGINT is KeyboardInterrupt and SIGTERM Terminated; in the main thread only."""
+    """In the body SIGINT is KeyboardInterrupt and SIGTERM Terminated; in the main thread only.
+
+    Also where Python drops exceptions: in a callback of C code (pymunk's are cffi's), a finaliser,
+    a weak reference's callback. From there it comes again.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     before = {number: signal.getsignal(number) for number in WORDS}
-    _set(signal.SIGINT, signal.default_int_handler)
-    _set(signal.SIGTERM, _terminate)
+    hook = sys.unraisablehook
+    heard = threading.Event()
+
+    def handle(number: int, frame: FrameType | None) -> NoReturn:
+        heard.set()
+        raise KeyboardInterrupt if number == signal.SIGINT else Terminated
+
+    def dropped(what: sys.UnraisableHookArgs) -> None:
+        number = {KeyboardInterrupt: signal.SIGINT, Terminated: signal.SIGTERM}.get(what.exc_type)
+        if number is None:
+            hook(what)
+            return
+        heard.clear()
+        threading.Thread(target=_until, args=(heard, number), daemon=True).start()
+
+    for number in WORDS:
+        _set(number, handle)
+    sys.unraisablehook = dropped
     try:
         yield
     finally:
+        heard.set()
+        sys.unraisablehook = hook
         for number, handler in before.items():
             signal.signal(number, handler)
 
@@ -72,8 +96,13 @@ def noted() -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, before)
 
 
-def _terminate(number: int, frame: FrameType | None) -> NoReturn:
-    raise Terminated
+def _until(heard: threading.Event, number: int) -> None:
+    """Send a signal to the main thread until it is heard: one that comes just before a wait begins
+    does not end that wait."""
+    main = threading.main_thread().ident
+    assert main is not None
+    while not heard.wait(_AGAIN_S):
+        signal.pthread_kill(main, number)
 
 
 def _set(number: int, handler: signal._HANDLER) -> None:
