@@ -5,8 +5,9 @@ DEMO_OPTIONS ?=
 IN_ENV := . ./env.sh &&
 # Tests start hundreds of processes: each would compile the sources anew where containers forbid it.
 PYTEST := PYTHONDONTWRITEBYTECODE= pytest
+SIDE_BY_SIDE := -m "not soak" --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 # `make check` runs these, `make test` all others.
-CHECKED := tests/test_architecture.py tests/test_documents.py
+CHECKED := tests/test_architecture.py tests/documents
 CODE := sim_pkg policy_pkg crash_coach_pkg ros_ws/src/crash_coach_common ros_ws/src/crash_coach_bringup \
     ros_ws/src/crash_coach_console tests benchmarks scripts examples
 PAGE := ros_ws/src/crash_coach_console/crash_coach_console/web
@@ -19,17 +20,17 @@ help: ## this list
 setup: ## .venv, pinned packages, built ROS workspace
 	@PYTHON="$(PYTHON)" $(if $(PYTHON),$(PYTHON),python3) scripts/setup.py
 
-check: setup ## ruff, mypy, the architecture's laws, the documents' commands
+check: setup environments ## ruff, mypy, the architecture's laws, the documents' commands
 	$(IN_ENV) ruff format --check $(CODE) && ruff check $(CODE)
 	$(IN_ENV) mypy sim_pkg/sim_pkg policy_pkg/policy_pkg crash_coach_pkg/crash_coach_pkg \
 	    ros_ws/src/crash_coach_common/crash_coach_common \
 	    ros_ws/src/crash_coach_bringup/crash_coach_bringup \
 	    ros_ws/src/crash_coach_console/crash_coach_console scripts benchmarks
 	$(IN_ENV) oxlint --quiet --deny-warnings $(PAGE)
-	$(IN_ENV) $(PYTEST) $(CHECKED)
+	$(IN_ENV) $(PYTEST) $(SIDE_BY_SIDE) -n 2 $(CHECKED)
 
 test: setup environments ## the test suite (but for what `make check` runs), under 5 minutes on 2 cores
-	$(IN_ENV) $(PYTEST) -m "not soak" -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0 $(CHECKED:%=--ignore=%)
+	$(IN_ENV) $(PYTEST) $(SIDE_BY_SIDE) -n 3 $(CHECKED:%=--ignore=%)
 
 demo: setup ## train two teams, run them as ROS graphs, crash robots, read off the cost
 	$(IN_ENV) crash-coach demo $(DEMO_OPTIONS)

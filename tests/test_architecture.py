@@ -150,7 +150,8 @@ def test_the_law_itself(package: str, inside: str, name: str, expected: bool) ->
 def test_acting_and_evaluating_do_not_load_torch() -> None:
     code = (
         "import sys, policy_pkg.policy, policy_pkg.checkpoint, policy_pkg.play.evaluate, "
-        "policy_pkg.play.rollout, policy_pkg.train.config; sys.exit('torch' in sys.modules)"
+        "policy_pkg.play.rollout, policy_pkg.train.config, policy_pkg.train.progress; "
+        "sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], timeout=250).returncode == 0
 

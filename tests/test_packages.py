@@ -96,10 +96,10 @@ def test_colcon_test_runs_every_room() -> None:
     tests = ROOT / "tests"
     left = {str(p.relative_to(tests)) for p in tests.rglob("test_*.py") if p not in covered}
     # Of the checkout, not of a package.
-    assert left == {
-        "test_documents.py", "test_documents_commands.py", "test_documents_names.py",
-        "test_packages.py", "test_setup.py",
-    }  # fmt: skip
+    assert {name for name in left if not name.startswith("documents/")} == {
+        "test_packages.py",
+        "test_setup.py",
+    }
 
 
 def test_colcon_test_finds_tests(tmp_path: Path) -> None:

@@ -117,7 +117,7 @@ class Teams:
             client.node.destroy_client(service)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def teams(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Teams]:
     folder = tmp_path_factory.mktemp("console")
     checkpoint = folder / "step_0"

@@ -10,7 +10,7 @@ from offline_recordings import Recording
 from policy_pkg.train.offline.config import OfflineConfig
 from policy_pkg.train.offline.run import read_data
 from policy_pkg.train.offline.run import train_offline as train_on
-from policy_pkg.train.run import RunSummary
+from policy_pkg.train.progress import RunSummary
 
 SMALL: dict[str, Any] = {
     "scenario": "buttons",

@@ -22,7 +22,7 @@ from policy_pkg.sweep.task import Task
 from policy_pkg.train.run_dir import newest_step
 
 if TYPE_CHECKING:
-    from policy_pkg.train.run import ProgressReport
+    from policy_pkg.train.progress import ProgressReport
 
 REPLAY = "replay.safetensors"
 PROGRESS_INTERVAL_S = 0.5

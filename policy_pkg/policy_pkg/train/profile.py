@@ -17,7 +17,8 @@ from typing import Any
 from crash_coach_common.contract import UserError
 from policy_pkg.train.blocks import Block
 from policy_pkg.train.config import TrainConfig
-from policy_pkg.train.run import Clock, ProgressReport, train
+from policy_pkg.train.progress import ProgressReport
+from policy_pkg.train.run import Clock, train
 from policy_pkg.train.session import TrainSession
 from sim_pkg.env import Env
 

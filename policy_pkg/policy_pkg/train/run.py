@@ -10,10 +10,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, ClassVar, Literal, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self
 
 from safetensors import SafetensorError
 from safetensors.numpy import save_file
@@ -24,13 +23,13 @@ from policy_pkg.learner.learner import DivergedError
 from policy_pkg.learner.threads import use_one_thread
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.metrics import Logged, RunLog, Value
+from policy_pkg.train.progress import OnProgress, Phase, ProgressReport, RunSummary, silent
 from policy_pkg.train.run_dir import RunConfig, extend_run, kept_scenario, locked, prepare_run
 from policy_pkg.train.session import TEST_ARENAS, TrainSession
 from policy_pkg.train.snapshot import Saved, restore, save, save_best
 from sim_pkg.env import ScenarioLike, make_any_env
 from sim_pkg.scenario_source import ScenarioSource
 
-Phase = Literal["training", "evaluation", "checkpoint", "finished"]
 Clock = Callable[[], float]
 MakeEnv = Callable[[ScenarioLike, int], BatchEnv]
 
@@ -92,48 +91,6 @@ class Session(Saved, Protocol):
     def end_block(self) -> dict[str, Value]:
         """Tests the policy; the block's line of metrics."""
         ...
-
-
-@dataclass(frozen=True)
-class ProgressReport:
-    """Where a run stands; from the first step on, the callback gets one a few times per second.
-
-    steps, total_steps: environment steps, or gradient steps of a run on recordings.
-    alpha, epsilon: None where the session decides neither.
-    success_rate, success_crash_free: of the last evaluation block; None where not measured.
-    steps_per_s, eta_s: from the last seconds; 0 for a finished run that was resumed.
-    warning: something that the user should know, or that was survived; reported once.
-    """
-
-    phase: Phase
-    steps: int
-    total_steps: int
-    alpha: float | None
-    epsilon: float | None
-    success_rate: float | None
-    success_crash_free: float | None
-    steps_per_s: float
-    eta_s: float
-    warning: str | None = None
-
-
-@dataclass(frozen=True)
-class RunSummary:
-    """A finished run. wall_s: of this process, 0 where the run was finished already."""
-
-    out_dir: Path
-    checkpoint: Path
-    steps: int
-    episodes: int
-    gradient_steps: int
-    wall_s: float
-    last_block: dict[str, Value]
-
-
-OnProgress = Callable[[ProgressReport], None]
-
-
-def silent(report: ProgressReport) -> None: ...
 
 
 def _never() -> bool:

@@ -12,7 +12,8 @@ from offline_runs import small as small_offline
 from offline_runs import train_offline
 
 from policy_pkg.checkpoint import find_checkpoint, load_policy, read_manifest
-from policy_pkg.train.run import ProgressReport, train
+from policy_pkg.train.progress import ProgressReport
+from policy_pkg.train.run import train
 
 UNITS = {"train": 200, "live": 200, "offline": 10}
 

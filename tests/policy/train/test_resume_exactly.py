@@ -23,7 +23,8 @@ from policy_pkg.checkpoint import (
     read_tensors,
 )
 from policy_pkg.train.config import TrainConfig
-from policy_pkg.train.run import Phase, ProgressReport, train
+from policy_pkg.train.progress import Phase, ProgressReport
+from policy_pkg.train.run import train
 
 CONFIG = TrainConfig.model_validate(
     {

@@ -18,7 +18,8 @@ from crash_coach_common.contract import EnvSpec, IntArray, StepResult, UserError
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.metrics import __doc__ as METRICS_DOC
-from policy_pkg.train.run import ProgressReport, TrainError, train
+from policy_pkg.train.progress import ProgressReport
+from policy_pkg.train.run import TrainError, train
 from policy_pkg.train.run_dir import RunError, locked, prepare_run
 from policy_pkg.train.session import TrainSession
 from sim_pkg.env import Env, make_env

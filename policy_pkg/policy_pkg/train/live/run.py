@@ -17,7 +17,8 @@ from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.live.order import Lockstep, Order, RealTime, Task
 from policy_pkg.train.live.session import LiveSession
 from policy_pkg.train.metrics import Value
-from policy_pkg.train.run import EndedEarly, ProgressReport, Run
+from policy_pkg.train.progress import ProgressReport
+from policy_pkg.train.run import EndedEarly, Run
 from sim_pkg.env import make_env
 
 Mode = Literal["lockstep", "realtime"]

@@ -11,7 +11,8 @@ from typing import Any
 from policy_pkg.train.offline.config import OfflineConfig
 from policy_pkg.train.offline.data import FixedData, Recorded, load_data
 from policy_pkg.train.offline.session import OfflineSession
-from policy_pkg.train.run import Clock, MakeEnv, OnProgress, Run, RunSummary, silent
+from policy_pkg.train.progress import OnProgress, RunSummary, silent
+from policy_pkg.train.run import Clock, MakeEnv, Run
 from policy_pkg.train.run_dir import kept_scenario
 from policy_pkg.train.session import TEST_ARENAS
 from sim_pkg.env import make_env

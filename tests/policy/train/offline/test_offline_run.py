@@ -28,7 +28,8 @@ from policy_pkg.statistics import binomial_weights
 from policy_pkg.train.offline.config import OfflineConfig
 from policy_pkg.train.offline.data import load_data
 from policy_pkg.train.offline.session import MEANS, OfflineSession
-from policy_pkg.train.run import EndedEarly, ProgressReport, TrainError
+from policy_pkg.train.progress import ProgressReport
+from policy_pkg.train.run import EndedEarly, TrainError
 from policy_pkg.train.run_dir import RunError
 
 DOCUMENT = Path(__file__).resolve().parents[4] / "docs" / "algorithms.md"

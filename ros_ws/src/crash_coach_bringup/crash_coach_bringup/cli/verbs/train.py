@@ -12,7 +12,7 @@ from crash_coach_bringup.cli.output import CliError, console, table
 from policy_pkg.train.config import load_train_config
 
 if TYPE_CHECKING:
-    from policy_pkg.train.run import RunSummary
+    from policy_pkg.train.progress import RunSummary
 
 
 def plan_jobs(

@@ -17,7 +17,7 @@ from policy_pkg.bags.problems import Problem
 from policy_pkg.train.offline.config import OfflineConfig, load_offline_config
 
 if TYPE_CHECKING:
-    from policy_pkg.train.run import ProgressReport
+    from policy_pkg.train.progress import ProgressReport
 
 
 def _tell(problem: Problem) -> None:

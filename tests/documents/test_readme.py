@@ -20,7 +20,7 @@ import pytest
 from crash_coach_bringup.ros.client import graph_client
 from crash_coach_bringup.ros.domain import reserve_domain
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 SMALL_DEMO = (
     "--layout single --episodes 2 --set total_steps=2000 test_interval_steps=1000 tensorboard=false"
 )

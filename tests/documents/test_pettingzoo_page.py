@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from in_process import typed
 
-PAGE = Path(__file__).resolve().parent.parent.parent / "docs" / "pettingzoo.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "pettingzoo.md"
 
 
 def commands() -> list[str]:

@@ -19,7 +19,7 @@ from rclpy.parameter_client import AsyncParameterClient
 
 from crash_coach_bringup.ros.client import graph_client
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 SHELL_S = 40.0  # a shell that sources env.sh and loads the command line, on a busy machine
 # Of nodes in general, and what every gate has in common.
 NOT_IN_THE_TABLE = {"robots", "use_sim_time", "start_type_description_service"}

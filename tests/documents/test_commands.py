@@ -12,7 +12,7 @@ import typer
 
 from crash_coach_bringup.cli.main import repeat_options, typed_app
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 # typer carries its own click, under a private name
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/**/*.md"))]
