@@ -12,7 +12,7 @@ CODE := sim_pkg policy_pkg crash_coach_pkg ros_ws/src/crash_coach_common ros_ws/
     ros_ws/src/crash_coach_console tests benchmarks scripts examples
 PAGE := ros_ws/src/crash_coach_console/crash_coach_console/web
 
-.PHONY: help setup check test demo bench soak ray environments format lock clean
+.PHONY: help setup check test demo bench soak ray mlflow environments format lock clean
 
 help: ## this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -29,7 +29,7 @@ check: setup environments ## ruff, mypy, the architecture's laws, the documents'
 	$(IN_ENV) oxlint --quiet --deny-warnings $(PAGE)
 	$(IN_ENV) $(PYTEST) $(SIDE_BY_SIDE) -n 2 $(CHECKED)
 
-test: setup environments ## the test suite (but for what `make check` runs), under 5 minutes on 2 cores
+test: setup mlflow environments ## the test suite (but for what `make check` runs), under 5 minutes on 2 cores
 	$(IN_ENV) $(PYTEST) $(SIDE_BY_SIDE) -n 3 $(CHECKED:%=--ignore=%)
 
 demo: setup ## train two teams, run them as ROS graphs, crash robots, read off the cost
@@ -38,11 +38,14 @@ demo: setup ## train two teams, run them as ROS graphs, crash robots, read off t
 bench: setup ## every benchmark, to runs/bench.json
 	$(IN_ENV) python -m benchmarks
 
-soak: setup ray environments ## fuzz, kill and latency tests at full size
+soak: setup ray mlflow environments ## fuzz, kill and latency tests at full size
 	$(IN_ENV) $(PYTEST) -m soak --timeout 3600
 
 ray: setup ## the extra that `crash-coach sweep --engine ray` needs
 	@.venv/bin/uv pip install --quiet --python .venv/bin/python -r requirements-ray.lock
+
+mlflow: setup ## the extra that the logger mlflow needs
+	@.venv/bin/uv pip install --quiet --python .venv/bin/python -r requirements-mlflow.lock
 
 environments: setup ## PettingZoo environments of others that the documents train on
 	@.venv/bin/uv pip install --quiet --python .venv/bin/python -r requirements-environments.lock
@@ -55,6 +58,8 @@ lock: setup ## requirements.in -> requirements.lock, and the extras'
 	    requirements.in -o requirements.lock
 	.venv/bin/uv pip compile --quiet --universal --no-header --python-version 3.11 \
 	    -c requirements.lock requirements-ray.in -o requirements-ray.lock
+	.venv/bin/uv pip compile --quiet --universal --no-header --python-version 3.11 \
+	    -c requirements.lock -c requirements-ray.lock requirements-mlflow.in -o requirements-mlflow.lock
 	.venv/bin/uv pip compile --quiet --universal --no-header --python-version 3.11 \
 	    -c requirements.lock requirements-environments.in -o requirements-environments.lock
 

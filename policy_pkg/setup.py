@@ -22,6 +22,7 @@ setup(
         "policy_pkg.sweep",
         "policy_pkg.train",
         "policy_pkg.train.live",
+        "policy_pkg.train.loggers",
         "policy_pkg.train.offline",
     ],
     package_data={

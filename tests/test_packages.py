@@ -31,7 +31,7 @@ KEYS = {
 }
 # rosdep knows none of these: they come from requirements.lock alone.
 WITHOUT_KEY = {
-    "imageio_ffmpeg", "lz4", "mcap", "onnx", "pettingzoo", "pymunk", "ray", "safetensors",
+    "imageio_ffmpeg", "lz4", "mcap", "mlflow", "onnx", "pettingzoo", "pymunk", "ray", "safetensors",
     "starlette", "threadpoolctl", "zstandard",
 }  # fmt: skip
 ROS = {

@@ -30,13 +30,14 @@ SEED = int(os.environ.get("HOSTILE_SEED", "0"))
 LIMIT_S = 300.0
 ENDLESS = frozenset(("gate", "console", "record", "up", "train-live"))
 RUN_S = 12.0  # of these
-TINY = "total_steps=300 n_envs=2 test_interval_steps=100 test_episodes=2 tensorboard=false"
+TINY = "total_steps=300 n_envs=2 test_interval_steps=100 test_episodes=2 loggers.tensorboard=false"
 COMMANDS = {
     "doctor": "doctor --json OUT.json",
     "train": f"train buttons/qmix --out OUT --seed 1 --set {TINY}",
     "train-live": f"train-live live/buttons --out OUT --layout single --set {TINY}",
     "train-offline": "train-offline offline/behaviour_cloning BAG --out OUT --seed 1 --set "
-    "gradient_steps=4 batch_episodes=4 test_interval_steps=2 test_episodes=2 tensorboard=false",
+    "gradient_steps=4 batch_episodes=4 test_interval_steps=2 test_episodes=2 "
+    "loggers.tensorboard=false",
     "sweep": "sweep SWEEP --out OUT --processes 2",
     "evaluate": "evaluate TEAM --episodes 4 --each-robot --json OUT.json",
     "profile": "profile buttons/qmix --seconds 2 --json OUT.json",

@@ -1,5 +1,5 @@
-"""A package from outside the repository adds a scenario kind, a strategy, a fault and a mixer: all
-of them are used from the command line."""
+"""A package from outside the repository adds a scenario kind, a strategy, a fault, a mixer and
+a logger: all of them are used from the command line."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ replay_episodes: 20
 test_interval_steps: 100
 test_episodes: 2
 checkpoint_interval_steps: {STEPS}
-tensorboard: false
+loggers: {{{{tensorboard: false, diary: {{{{title: Patrol}}}}}}}}
 learner: {{{{algorithm: weighted, hidden: 16, mixing_hidden: 8, hypernet_hidden: 8}}}}
 coach: {{{{strategy: steady, crash_mode: limp, crash_parameters: {{{{every: 3}}}}}}}}
 """
@@ -64,6 +64,7 @@ def run(site: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     config.write_text(SMALL.format(scenario=patrol(folder, 0.5)))
     done = crash_coach(site, "train", str(config), "--out", str(folder / "run"), "--seed", "1")
     assert done.returncode == 0, done.stderr
+    assert "diary was not told metrics at 200 steps: no ink" in " ".join(done.stdout.split())
     return folder / "run"
 
 
@@ -71,6 +72,15 @@ def test_the_strategy_decides_the_rate_of_the_training(run: Path) -> None:
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert [line["alpha"] for line in lines] == [0.25, 0.5, 0.5, 0.5]
     assert lines[-1]["crashed_fraction"] > 0
+
+
+def test_the_logger_is_told_of_the_run(run: Path) -> None:
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    told = [f"{line['env_steps']}: {line['success_rate']}" for line in lines]
+    assert (run / "diary.txt").read_text().splitlines() == [
+        "Patrol: from step 0, hidden 16, commit True", told[0], told[1], told[3], "finished",
+    ]  # fmt: skip
+    assert not (run / "tensorboard").exists()
 
 
 def test_the_mixer_is_what_the_training_learns(run: Path) -> None:

@@ -18,7 +18,8 @@ SETTINGS = (
     "scenario=pettingzoo:corridor_env:Corridor", "env_args.length=5", "env_rules.stay_action=0",
     "env_rules.success_info=all_through", "total_steps=1200", "n_envs=4", "batch_episodes=4",
     "replay_episodes=50", "updates_per_episode=0.5", "test_interval_steps=400", "test_episodes=4",
-    "tensorboard=false", "learner.hidden=16", "coach.strategy=adaptive", "coach.adaptive.beta=0",
+    "loggers.tensorboard=false",
+    "learner.hidden=16", "coach.strategy=adaptive", "coach.adaptive.beta=0",
 )  # fmt: skip
 
 

@@ -63,7 +63,7 @@ def command(*arguments: str) -> Result:
 
 def test_the_verb_writes_what_it_prints(tmp_path: Path) -> None:
     out = tmp_path / "profile.json"
-    small = ("n_envs=4", "batch_episodes=2", "learner.hidden=8", "tensorboard=false")
+    small = ("n_envs=4", "batch_episodes=2", "learner.hidden=8", "loggers.tensorboard=false")
     done = command("buttons/qmix", "--seconds", "1", "--json", str(out), "--set", *small)
     assert done.exit_code == 0, done.output
     result = json.loads(out.read_text())

@@ -32,7 +32,7 @@ SETTINGS: dict[str, Any] = {
     "test_interval_steps": 200,
     "test_episodes": 4,
     "checkpoint_interval_steps": 200,
-    "tensorboard": False,
+    "loggers": {"tensorboard": False},
     "learner": {"hidden": 16, "mixing_hidden": 8, "hypernet_hidden": 8},
 }
 

@@ -25,7 +25,7 @@ from policy_pkg.train.offline.data import load_data
 
 QUICK = [
     "--set", "gradient_steps=6", "batch_episodes=4", "test_interval_steps=3", "test_episodes=2",
-    "tensorboard=false", "learner.hidden=8",
+    "loggers.tensorboard=false", "learner.hidden=8",
 ]  # fmt: skip
 
 

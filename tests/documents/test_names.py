@@ -23,6 +23,7 @@ ELSEWHERE = {
     "my_faults/hiccup.py",
     "my_strategies/weakest.py",
     "best/",
+    "mlflow.db",
     "policy.pt",
     "publish_time",
     "return_1_crashed",

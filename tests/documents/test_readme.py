@@ -22,7 +22,8 @@ from crash_coach_bringup.ros.domain import reserve_domain
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL_DEMO = (
-    "--layout single --episodes 2 --set total_steps=2000 test_interval_steps=1000 tensorboard=false"
+    "--layout single --episodes 2 "
+    "--set total_steps=2000 test_interval_steps=1000 loggers.tensorboard=false"
 )
 DISTRIBUTION = Path("/opt/ros/jazzy/setup.bash")
 

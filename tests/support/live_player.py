@@ -39,7 +39,7 @@ SMALL: dict[str, Any] = {
     "test_interval_steps": 200,
     "test_episodes": 3,
     "checkpoint_interval_steps": 200,
-    "tensorboard": False,
+    "loggers": {"tensorboard": False},
     "learner": {"hidden": 16, "mixing_hidden": 8, "hypernet_hidden": 8},
 }
 

@@ -19,7 +19,7 @@ SMALL: dict[str, Any] = {
     "test_interval_steps": 10,
     "test_episodes": 4,
     "checkpoint_interval_steps": 20,
-    "tensorboard": False,
+    "loggers": {"tensorboard": False},
     "learner": {
         "hidden": 16,
         "mixing_hidden": 8,

@@ -1,5 +1,5 @@
-"""A package from outside the repository: a scenario kind, a coaching strategy, a fault mode and a
-mixer, each of them an entry point."""
+"""A package from outside the repository: a scenario kind, a coaching strategy, a fault mode, a
+mixer and an experiment logger, each of them an entry point."""
 
 from __future__ import annotations
 
@@ -91,6 +91,37 @@ class Weighted(nn.Module):
     def forward(self, values, state):
         return (self.weigh(state).abs() * values).sum(1) + self.value(state).squeeze(1)
 '''
+LOGGERS = '''
+from crash_coach_common.strict_yaml import StrictModel
+from policy_pkg.train.loggers.base import ExperimentLogger
+
+
+class DiaryOptions(StrictModel):
+    title: str
+
+
+class Diary(ExperimentLogger):
+    """A line of text per block."""
+
+    Options = DiaryOptions
+
+    def __init__(self, start, options):
+        self._path = start.out_dir / "diary.txt"
+        hidden, commit = start.settings["learner.hidden"], "commit" in start.about
+        self._note(f"{options.title}: from step {start.step}, hidden {hidden}, commit {commit}")
+
+    def _note(self, text):
+        with open(self._path, "a", encoding="utf-8") as file:
+            file.write(text + "\\n")
+
+    def log_metrics(self, line, step):
+        if line["env_steps"] == 200:
+            raise OSError("no ink")
+        self._note(f"{step}: {line['success_rate']}")
+
+    def finalize(self, status):
+        self._note(status)
+'''
 POINTS = """
 [crash_coach.scenarios]
 patrol = own:KIND
@@ -103,6 +134,9 @@ limp = own:Limp
 
 [crash_coach.mixers]
 weighted = own_mixers:Weighted
+
+[crash_coach.loggers]
+diary = own_loggers:Diary
 """
 PROJECT = """
 [project]
@@ -110,7 +144,7 @@ name = "own-robots"
 version = "1.0"
 
 [tool.setuptools]
-py-modules = ["own", "own_mixers"]
+py-modules = ["own", "own_loggers", "own_mixers"]
 """
 
 
@@ -119,6 +153,7 @@ def install_really(source: Path, site: Path) -> None:
     source.mkdir()
     (source / "own.py").write_text(SOURCE)
     (source / "own_mixers.py").write_text(MIXERS)
+    (source / "own_loggers.py").write_text(LOGGERS)
     points = POINTS.replace("[", '[project.entry-points."').replace("]", '"]')
     quoted = re.sub(r"(?m)^(\w+) = (.+)$", r'\1 = "\2"', points)
     (source / "pyproject.toml").write_text(PROJECT + quoted)

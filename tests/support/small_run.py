@@ -15,7 +15,7 @@ SMALL = {
     "test_interval_steps": 300,
     "test_episodes": 4,
     "checkpoint_interval_steps": 300,
-    "tensorboard": False,
+    "loggers": {"tensorboard": False},
     "learner": {"hidden": 16, "mixing_hidden": 8, "hypernet_hidden": 8},
     "coach": {"strategy": "adaptive", "adaptive": {"rho": 0.2, "beta": 0.0}},
 }

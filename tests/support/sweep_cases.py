@@ -23,7 +23,7 @@ TINY: dict[str, Any] = {
         "test_interval_steps": 200,
         "test_episodes": 4,
         "checkpoint_interval_steps": 400,
-        "tensorboard": False,
+        "loggers.tensorboard": False,
         "learner.hidden": 16,
         "learner.mixing_hidden": 8,
         "learner.hypernet_hidden": 8,

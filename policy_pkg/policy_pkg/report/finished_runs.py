@@ -47,7 +47,7 @@ from sim_pkg.scenario_source import ScenarioSource, short_name
 
 NO_SETTING = {
     *("scenario", "seed", *LENGTHS),
-    *("tensorboard", "checkpoint_interval_steps", "checkpoint_replay"),
+    *("loggers", "checkpoint_interval_steps", "checkpoint_replay"),
 }
 
 

@@ -34,6 +34,7 @@ from policy_pkg.train.config import (
     load_train_tree,
     with_settings,
 )
+from policy_pkg.train.loggers import Chosen
 from sim_pkg.env import make_any_env
 from sim_pkg.scenario_source import ScenarioSource, short_name
 
@@ -256,7 +257,8 @@ class _Expansion:
 
 
 def check_fits(config: TrainConfig) -> None:
-    """Raises UserError where the scenario is unknown, or the coach's settings do not fit it."""
+    """Raises UserError where the scenario or a logger is unknown, or the coach does not fit."""
+    Chosen(config.loggers)
     spec = _spec(config.scenario_source())
     Coach(config.coach, TeamSpec.of(spec), config.seed).check_scenario(spec)
 

@@ -28,7 +28,7 @@ from policy_pkg.train.run_dir import RUN, RunError, check_same, newest_step, rea
 
 HIDDEN = ".sweep"
 # Where it matters not for what is learned, a run may have been done with another setting.
-NO_MATTER = {"tensorboard", "checkpoint_interval_steps", "checkpoint_replay"}
+NO_MATTER = {"loggers", "checkpoint_interval_steps", "checkpoint_replay"}
 
 Kind = Literal["finished", "kept", "started", "new"]
 

@@ -6,13 +6,15 @@ from collections.abc import Iterable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
+from crash_coach_common.contract import UserError
 from crash_coach_common.strict_yaml import (
     ConfigError,
+    StrictModel,
     YamlTree,
     did_you_mean,
     load_tree,
@@ -23,6 +25,7 @@ from crash_coach_common.strict_yaml import (
 from crash_coach_pkg.coach.config import CoachConfig
 from policy_pkg.learner.config import LearnerConfig
 from policy_pkg.learner.strata import Strata
+from policy_pkg.train.loggers import Chosen
 from sim_pkg.foreign.config import EnvRules
 from sim_pkg.scenario_source import NO_RULES, ScenarioSource, read_scenario
 
@@ -31,14 +34,31 @@ OFFLINE = "offline"  # its folder is that of `train-offline`
 TRAINING = "training config"
 SWEEPS = ("paper", "recipe")  # their folders are those of `sweep`
 
-ModelT = TypeVar("ModelT", bound=BaseModel)
+SettingsT = TypeVar("SettingsT", bound="RunSettings")
 
 
-class TrainConfig(BaseModel):
+def _with_defaults(loggers: dict[str, Any]) -> dict[str, bool | dict[str, Any]]:
+    for name, told in loggers.items():
+        if not isinstance(told, bool | dict):
+            raise ValueError(f"{name} = {told!r}: must be true, false, or the logger's options")
+    told = {name: True if options == {} else options for name, options in loggers.items()}
+    return {"tensorboard": True, **told}
+
+
+class RunSettings(StrictModel):
+    """What every training run has, whatever it learns from."""
+
+    loggers: Annotated[dict[str, Any], AfterValidator(_with_defaults)] = Field(
+        {},
+        validate_default=True,
+        description="who is told of the metrics beside metrics.jsonl, by name: tensorboard (unless "
+        "it is false), mlflow, another package's; true, false, or its options",
+    )
+
+
+class TrainConfig(RunSettings):
     """One training run. The defaults are those of ``configs/train/buttons/qmix.yaml``, which says
     what each key is for."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     scenario: str = Field(
         description="shipped scenario's name, path of a .yaml file, or "
@@ -96,7 +116,6 @@ class TrainConfig(BaseModel):
     checkpoint_replay: bool = Field(
         True, description="save the replay: without it, resuming starts with an empty one"
     )
-    tensorboard: bool = Field(True, description="write the metrics for TensorBoard as well")
     learner: LearnerConfig = LearnerConfig.model_validate({})
     coach: CoachConfig = CoachConfig()
 
@@ -181,12 +200,12 @@ def load_train_config(
 
 
 def load_config(
-    model: type[ModelT],
+    model: type[SettingsT],
     known: tuple[str, ...],
     source: str | Path,
     overrides: Sequence[str],
     seed: int | None,
-) -> ModelT:
+) -> SettingsT:
     """Reads a config of ``model``, which has a key ``seed``.
 
     Args:
@@ -199,7 +218,13 @@ def load_config(
         ConfigError: names the file and line or the override, the key, the value, what is right.
     """
     given = [_parse(text) for text in [*overrides, *([] if seed is None else [f"seed={seed}"])]]
-    return validate(with_settings(load_tree(find_config(TRAINING, source, known)), given), model)
+    tree = with_settings(load_tree(find_config(TRAINING, source, known)), given)
+    config = validate(tree, model)
+    try:
+        Chosen(config.loggers)
+    except UserError as error:
+        raise ConfigError(f"{tree.where(('loggers',))}: {error}") from error
+    return config
 
 
 def load_train_tree(source: str | Path) -> YamlTree:

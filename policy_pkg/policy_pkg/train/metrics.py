@@ -48,13 +48,9 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from crash_coach_common.contract import UserError
-from policy_pkg.train.run_dir import METRICS, TENSORBOARD, TIMING
-
-if TYPE_CHECKING:
-    from policy_pkg.train.tensorboard import TensorBoard
+from policy_pkg.train.run_dir import METRICS, TIMING
 
 Value = str | int | float | None
 
@@ -154,14 +150,13 @@ class Logged:
 
 
 class RunLog:
-    """``metrics.jsonl``, ``timing.jsonl`` and, where asked for, TensorBoard's events.
+    """``metrics.jsonl`` and ``timing.jsonl``.
 
     Args:
         out_dir: the run directory.
         logged: what the checkpoint knows of these files; what lies behind is cut off.
         clock_s, step: the clock and the steps done at the start.
         step_key: what steps are called in ``timing.jsonl``.
-        tensorboard: whether to write events.
     """
 
     def __init__(
@@ -171,11 +166,9 @@ class RunLog:
         clock_s: float,
         step: int,
         step_key: str,
-        tensorboard: bool,
     ) -> None:
         self._metrics = JsonLines(out_dir / METRICS, logged.metrics_bytes)
         self._timing = JsonLines(out_dir / TIMING, logged.timing_bytes)
-        self._board = _board(out_dir / TENSORBOARD, step) if tensorboard else None
         self._started_s = self._block_s = clock_s
         self._block_step = step
         self._step_key = step_key
@@ -196,8 +189,6 @@ class RunLog:
         self._timing.append({self._step_key: step, "wall_s": wall_s, "steps_per_s": speed})
         self._metrics.flush()
         self._timing.flush()
-        if self._board is not None:
-            self._board.write(line, step)
 
     def sync(self) -> Logged:
         """Waits until everything is on the disk; returns what a checkpoint has to know.
@@ -210,12 +201,3 @@ class RunLog:
     def close(self) -> None:
         self._metrics.close()
         self._timing.close()
-        if self._board is not None:
-            self._board.close()
-
-
-def _board(folder: Path, purge_step: int) -> TensorBoard:
-    # Imported here: who only reads metrics need not wait for it.
-    from policy_pkg.train.tensorboard import TensorBoard
-
-    return TensorBoard(folder, purge_step)

@@ -22,9 +22,19 @@ from policy_pkg.checkpoint import CHECKPOINTS, list_checkpoints
 from policy_pkg.learner.learner import DivergedError
 from policy_pkg.learner.threads import use_one_thread
 from policy_pkg.train.config import TrainConfig
+from policy_pkg.train.loggers import Chosen
+from policy_pkg.train.loggers.base import Start, Status
 from policy_pkg.train.metrics import Logged, RunLog, Value
 from policy_pkg.train.progress import OnProgress, Phase, ProgressReport, RunSummary, silent
-from policy_pkg.train.run_dir import RunConfig, extend_run, kept_scenario, locked, prepare_run
+from policy_pkg.train.run_dir import (
+    RunConfig,
+    extend_run,
+    flat,
+    kept_scenario,
+    locked,
+    prepare_run,
+    read_run,
+)
 from policy_pkg.train.session import TEST_ARENAS, TrainSession
 from policy_pkg.train.snapshot import Saved, restore, save, save_best
 from sim_pkg.env import ScenarioLike, make_any_env
@@ -175,10 +185,12 @@ class Run:
         self._on_block, self._stopped = on_block, stopped
         self._warnings = deque(warnings)
         self._held = ExitStack()
+        self._finished = False
 
     def __enter__(self) -> Self:
         use_one_thread()
         session, out_dir = self._session, self._out_dir
+        self._loggers = Chosen(session.config.loggers)
         prepare_run(out_dir, session.config, self._resume, self._data, self._scenario)
         with ExitStack() as held:
             held.enter_context(locked(out_dir))
@@ -189,9 +201,11 @@ class Run:
             self._saved_steps = steps = session.steps
             self._started_s = self._reported_s = self._clock()
             self._marks = deque([(self._started_s, steps)])
-            board = session.config.tensorboard and not session.finished
-            self._log = RunLog(out_dir, logged, self._started_s, steps, session.STEPS, board)
+            self._log = RunLog(out_dir, logged, self._started_s, steps, session.STEPS)
             held.callback(self._log.close)
+            if not session.finished:
+                about = read_run(out_dir)
+                self._loggers.begin(Start(out_dir, flat(about["config"]), about, steps))
             self._held = held.pop_all()
         return self
 
@@ -201,7 +215,10 @@ class Run:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._held.close()
+        with self._held:
+            early = error is None or isinstance(error, EndedEarly | KeyboardInterrupt)
+            ended: Status = "stopped" if early else "failed"
+            self._warn(self._loggers.finalize("finished" if self._finished else ended))
 
     def go(self) -> RunSummary:
         """To the end: however the last step came about, a block and a checkpoint lie behind it.
@@ -223,6 +240,7 @@ class Run:
                     self._save()
                 raise EndedEarly
             self._advance()
+        self._finished = True
         self._report("finished")
         return self._summary()
 
@@ -242,6 +260,7 @@ class Run:
             self._log.write(line, self._clock(), steps)
         except OSError as error:
             self._report("training", f"metrics at {steps} steps wait to be written: {error}")
+        self._warn(self._loggers.log_metrics(line, steps))
         if session.best_is_now:
             self._save_best()
         due = steps - self._saved_steps
@@ -269,6 +288,10 @@ class Run:
                     f"{problem}; make room and resume {self._out_dir} to get the result"
                 ) from error
             self._report("checkpoint", f"{problem}; the next block tries again")
+
+    def _warn(self, problems: Sequence[str]) -> None:
+        for problem in problems:
+            self._report("training", problem)
 
     def _report(self, phase: Phase, warning: str | None = None) -> None:
         session, now = self._session, self._clock()

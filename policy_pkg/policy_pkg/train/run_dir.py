@@ -8,7 +8,7 @@
     timing.jsonl      the clock's figures of the same blocks
     checkpoints/step_000100000/
     best/step_000090000/      the acting half at the best of the run's own evaluation blocks
-    tensorboard/
+    tensorboard/, mlflow.json ...    what the experiment loggers leave (see loggers)
 """
 
 from __future__ import annotations
@@ -40,7 +40,6 @@ from sim_pkg.scenario_source import ScenarioSource, read_scenario
 RUN = "run.json"
 METRICS = "metrics.jsonl"
 TIMING = "timing.jsonl"
-TENSORBOARD = "tensorboard"
 SCENARIO = "scenario"
 LENGTHS = ("total_steps", "gradient_steps")  # of a run: trained in the simulator, or offline
 FORMAT = "crash-coach-run"
@@ -173,8 +172,11 @@ def read_run(out_dir: Path) -> dict[str, Any]:
         raise RunError(f"{path} cannot be read: {error}") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise RunError(f'{path} does not describe a run: no "format": "{FORMAT}"')
-    if isinstance(config := content.get("config"), dict) and "beta" in config.get("coach", {}):
-        config["coach"] = _own_settings(config["coach"])
+    if isinstance(config := content.get("config"), dict):
+        if "beta" in config.get("coach", {}):
+            config["coach"] = _own_settings(config["coach"])
+        if "tensorboard" in config:  # of when it was the only logger
+            config["loggers"] = {"tensorboard": config.pop("tensorboard")}
     return content
 
 

@@ -61,7 +61,9 @@ def test_a_folder_of_another_configuration_is_refused(run: SweepRun, tmp_path: P
 @pytest.mark.parametrize("place", ["buttons/qmix-s0", "qmix-s0"])
 def test_a_finished_run_elsewhere_counts(run: SweepRun, tmp_path: Path, place: str) -> None:
     kept = tmp_path / "results"
-    shorter = run.config.model_copy(update={"tensorboard": True, "checkpoint_replay": False})
+    shorter = run.config.model_copy(
+        update={"loggers": {"tensorboard": True}, "checkpoint_replay": False}
+    )
     write_run(kept / place, shorter, 2000)
     found = standing(run, tmp_path / "out", [tmp_path, kept])
     assert (found.kind, found.path) == ("kept", kept / place)

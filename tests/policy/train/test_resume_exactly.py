@@ -39,7 +39,7 @@ CONFIG = TrainConfig.model_validate(
         "test_interval_steps": 200,
         "test_episodes": 6,
         "checkpoint_interval_steps": 400,
-        "tensorboard": False,
+        "loggers": {"tensorboard": False},
         "learner": {
             "hidden": 16,
             "mixing_hidden": 8,

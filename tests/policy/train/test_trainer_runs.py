@@ -30,7 +30,7 @@ def lines(run: Path, name: str = "metrics.jsonl") -> list[dict[str, object]]:
 
 
 def test_a_run_writes_what_it_promises(tmp_path: Path) -> None:
-    config = small(tensorboard=True)
+    config = small(loggers={"tensorboard": True})
     run = tmp_path / "runs" / "x"
     reports: list[ProgressReport] = []
     summary = train(config, run, progress=reports.append)

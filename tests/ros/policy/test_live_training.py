@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from crash_coach_interfaces.msg import EpisodeState
+from in_process import typed
 from live_player import InProcess, small
 from rclpy.qos import QoSProfile
 
@@ -30,8 +31,11 @@ from crash_coach_bringup.ros.live import LiveOptions, graph_options, run_live, t
 from crash_coach_bringup.ros.supervisor import Event, Supervisor
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.train.config import load_train_config
+from policy_pkg.train.run import train
 
 WAIT_S = 90.0
+TOLD = "{run}: saved at {steps:,} steps; the same command with --resume goes on from there"
+NOTHING = "{run}: interrupted before there was anything to save"
 
 
 def overrides(**changes: Any) -> tuple[str, ...]:
@@ -106,6 +110,38 @@ def test_lock_step_killed_and_resumed_is_as_if_it_had_never_stopped(tmp_path: Pa
     assert metrics(run) == core.lines
     newest = sorted(saved.iterdir())[-1]
     assert (newest / "agent.safetensors").read_bytes() == core.session.agent
+
+
+@pytest.mark.soak
+def test_ctrl_c_ends_all_and_says_how_to_go_on(tmp_path: Path) -> None:
+    run, log = tmp_path / "run", tmp_path / "log"
+    command = [sys.executable, "-m", "crash_coach_bringup.cli.main", "train-live", "live/buttons"]
+    command += ["--out", str(run), "--set", *overrides(total_steps=1_000_000)]
+    saved = run / "checkpoints"
+    with log.open("wb") as file, subprocess.Popen(command, stdout=file, stderr=file) as child:
+        until(lambda: saved.is_dir() and any(saved.iterdir()), "a checkpoint", log)
+        child.send_signal(signal.SIGINT)
+        assert child.wait(WAIT_S) == 130, log.read_text()
+    newest = int(sorted(saved.iterdir())[-1].name.removeprefix("step_"))
+    assert log.read_text().splitlines()[-1] == TOLD.format(run=run, steps=newest)
+
+
+def test_an_interrupted_command_says_how_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The command's part, with what lies there when the processes have ended."""
+
+    def interrupted(options: LiveOptions, *tell: Any) -> int:
+        options.out.mkdir(exist_ok=True)
+        return 130
+
+    monkeypatch.setattr("crash_coach_bringup.ros.live.run_live", interrupted)
+    run = tmp_path / "run"
+    done = typed("train-live", "live/buttons", "--out", str(run))
+    assert (done.returncode, done.stdout.strip()) == (130, NOTHING.format(run=run))
+    train(small(total_steps=200), run)
+    done = typed("train-live", "live/buttons", "--out", str(run), "--resume")
+    assert (done.returncode, done.stdout.strip()) == (130, TOLD.format(run=run, steps=200))
 
 
 # --- a trainer that dies --------------------------------------------------------------------

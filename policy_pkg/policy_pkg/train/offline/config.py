@@ -8,12 +8,11 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from crash_coach_common.strict_yaml import StrictModel
 from policy_pkg.learner.config import LearnerConfig
-from policy_pkg.train.config import config_names, load_config
+from policy_pkg.train.config import RunSettings, config_names, load_config
 
 
-class OfflineConfig(StrictModel):
+class OfflineConfig(RunSettings):
     """One run on a fixed data set. ``configs/train/offline/conservative_qmix.yaml`` shows every
     key and says what it is for."""
 
@@ -52,7 +51,6 @@ class OfflineConfig(StrictModel):
     checkpoint_interval_steps: int = Field(
         5_000, ge=1, description="gradient steps between two checkpoints, at block ends"
     )
-    tensorboard: bool = Field(True, description="write the metrics for TensorBoard as well")
     learner: LearnerConfig = LearnerConfig.model_validate({})
 
     @model_validator(mode="after")

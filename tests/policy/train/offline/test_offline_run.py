@@ -55,7 +55,10 @@ def lines(run: Path) -> list[dict[str, Any]]:
 
 
 def test_a_run_writes_what_it_promises(tmp_path: Path, recordings: list[Recording]) -> None:
-    config, run = small(learner=CONSERVATIVE, tensorboard=True), tmp_path / "runs" / "x"
+    config, run = (
+        small(learner=CONSERVATIVE, loggers={"tensorboard": True}),
+        tmp_path / "runs" / "x",
+    )
     reports: list[ProgressReport] = []
     summary = train_offline(config, recordings, run, progress=reports.append, sources=["bags/one"])
     blocks = lines(run)

@@ -45,7 +45,7 @@ HINTS = {
     "coach": "nothing to set",
     "evaluation": "a longer test_interval_steps, fewer test_episodes, or test_crash_free=false",
     "checkpoint": "a longer checkpoint_interval_steps, or checkpoint_replay=false",
-    "rest": "tensorboard=false",
+    "rest": "loggers.tensorboard=false",
 }
 
 
