@@ -18,6 +18,7 @@ from crash_coach_common.contract import UserError
 from policy_pkg.episode import Sizes
 from policy_pkg.learner.config import LearnerConfig
 from policy_pkg.learner.learner import Learner
+from policy_pkg.learner.mixer import make_mixer
 
 PAGE = Path(__file__).parents[3] / "docs/adding_an_algorithm.md"
 SIZES = Sizes(n_robots=2, n_actions=3, obs_size=4, state_size=5, episode_limit=6)
@@ -79,19 +80,12 @@ def test_the_pages_mixer_learns_the_two_step_game(tmp_path: Path) -> None:
 def test_a_mixer_that_cannot_be_used_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, message: str
 ) -> None:
-    code = (
-        "from policy_pkg.learner.config import LearnerConfig\n"
-        "from policy_pkg.learner.mixer import make_mixer\n"
-        "from policy_pkg.episode import Sizes\n"
-        "make_mixer(LearnerConfig(algorithm='attention'), Sizes(2, 3, 4, 5, 6))"
-    )
     install(tmp_path, points=points(blocks()["pyproject.toml"]))
     (tmp_path / "my_mixers.py").write_text(source)
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment(tmp_path), capture_output=True, timeout=300
-    )
-    assert "UserError" in done.stderr.decode()
-    assert re.search(message, done.stderr.decode())
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "my_mixers", raising=False)
+    with pytest.raises(UserError, match=message):
+        make_mixer(LearnerConfig(algorithm="attention"), SIZES)
 
 
 def test_an_unknown_algorithm_is_refused_with_the_known_ones() -> None:
