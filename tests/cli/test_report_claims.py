@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 from crash_coach_bringup.cli.report.other_tables import as_csv, as_latex
 from crash_coach_bringup.cli.report.time_left import TimeLeft
 from policy_pkg.play.conditions import crash_free, exactly
+from policy_pkg.report.coping import coping
 from policy_pkg.report.finished_runs import Run
 from policy_pkg.report.kept_evaluations import Outcome, Result
 from policy_pkg.report.marl_eval import as_marl_eval
@@ -84,13 +86,33 @@ def test_last_blocks_and_what_the_blocks_played(tmp_path: Path) -> None:
     assert found.evaluation_episodes == 8 + 2 * 3
 
 
+def test_when_a_team_copes_block_by_block(tmp_path: Path) -> None:
+    def probe(steps: int, *victims: float | None, free: float = 1.0) -> dict[str, Any]:
+        names = ("success_robot_1_crashed", "success_robot_2_crashed")
+        return block(steps, free, **dict(zip(names, victims, strict=True)))
+
+    copes, one_fails, untested = (1.0, 0.8), (1.0, 0.79), (None, None)
+    late = [probe(10, *one_fails), *(probe(10 * k, *copes) for k in range(2, 13))]
+    lost = [probe(10, *copes), probe(20, *copes, free=0.5), probe(30, *untested), block(40, 1.0)]
+    runs = {"late": late, "lost": lost, "never": [probe(10, *one_fails)], "none": [block(10, 1.0)]}
+    results = []
+    for seed, (name, lines) in enumerate(runs.items()):
+        run = replace(run_of(tmp_path / name, lines, test_episodes=8), seed=seed)
+        results.append(Result(run, [], training_of(run)))
+    (found,) = coping(results[::-1])
+    assert found.seeds == (0, 1, 2)  # nothing is known of the one without victims
+    assert found.at_end == (True, False, False)
+    assert (found.last, found.last_blocks) == ((10, 1, 0), 10 + 2 + 1)
+    assert found.first_steps == (20, 10, None)
+
+
 def outcome(successes: int) -> Outcome:
     return Outcome(successes, 8, False, successes / 2, 5.0, "")
 
 
 def test_marl_eval(tmp_path: Path) -> None:
     run = run_of(tmp_path / "a", [])
-    training = Training(((10, 0.25, 1.0), (20, 0.5, 2.0)), 2, 8)
+    training = Training(((10, 0.25, 1.0), (20, 0.5, 2.0)), (), 2, 8)
     result = Result(run, [(crash_free(), outcome(6)), (exactly(1), outcome(2))], training)
     found = as_marl_eval([result])
     assert found["crash_coach, crash-free"]["buttons"]["qmix"]["seed_3"] == {

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from crash_coach_common.contract import UserError
+from crash_coach_common.natural import natural
 from policy_pkg.bags.about import About, about_from_record
 from policy_pkg.bags.problems import BagError, Problem, Report
 from policy_pkg.bags.records import Channel, ChannelTable, Entry, channels_of, entries
@@ -21,11 +21,6 @@ class Bag:
 
     name: str
     files: tuple[Path, ...]
-
-
-def natural(text: str) -> list[tuple[int, str]]:
-    """Sort key: robot_2 before robot_10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", text)]
 
 
 def find_bags(paths: Sequence[Path]) -> list[Bag]:

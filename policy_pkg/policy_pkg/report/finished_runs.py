@@ -16,6 +16,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from crash_coach_common.natural import natural
 from crash_coach_pkg.coach.config import CoachConfig
 from policy_pkg.checkpoint import (
     AGENT,
@@ -95,15 +96,16 @@ def find_runs(folders: Iterable[Path]) -> list[Path]:
     found: list[Path] = []
     for given in folders:
         folder, best = split_best(given)
-        inside = [folder] if (folder / RUN).is_file() else _inside(folder)
+        inside = [folder] if (folder / RUN).is_file() else runs_below(folder)
         if not inside:
             raise RunError(f"{folder}: neither a run nor a folder of runs: no {RUN}, no */{RUN}")
         found += [p.with_name(p.name + AT_BEST) for p in inside] if best else inside
     return list(dict.fromkeys(found))
 
 
-def _inside(folder: Path) -> list[Path]:
-    return sorted(path.parent for path in folder.glob(f"*/{RUN}"))
+def runs_below(folder: Path) -> list[Path]:
+    """The runs that lie directly in a folder: run-s2 before run-s10."""
+    return sorted((p.parent for p in folder.glob(f"*/{RUN}")), key=lambda p: natural(p.name))
 
 
 def methods_of(runs: Iterable[Run]) -> list[str]:

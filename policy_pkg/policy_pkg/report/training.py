@@ -12,6 +12,7 @@ from policy_pkg.report.finished_runs import Run, read_lines
 from policy_pkg.train.run_dir import METRICS
 
 LAST_BLOCKS = 10
+COPES = 0.8  # success rate, crash-free and with each robot crashed
 CRASH_FREE = "success_crash_free"
 CRASH_FREE_RETURN = "return_crash_free"
 
@@ -21,10 +22,13 @@ class Training:
     """Figures of a run's metrics; None where it did not keep them.
 
     ``blocks``: those with crash-free episodes, oldest first: (steps, success rate, mean return).
-    ``episodes``: that it learned from. ``evaluation_episodes``: that its blocks played besides.
+    ``coped``: of those that tested each robot crashed, oldest first: steps, and whether the team
+    succeeded in COPES of the episodes of each condition. ``episodes``: that it learned from.
+    ``evaluation_episodes``: that its blocks played besides.
     """
 
     blocks: tuple[tuple[int, float, float], ...]
+    coped: tuple[tuple[int, bool], ...]
     episodes: int | None
     evaluation_episodes: int | None
 
@@ -48,10 +52,25 @@ def training_of(run: Run) -> Training:
         for line in lines
         if line.get(CRASH_FREE) is not None and line.get(CRASH_FREE_RETURN) is not None
     )
+    coped = tuple((_steps(line), copes) for line in lines if (copes := _copes(line)) is not None)
     if not lines or "episodes" not in lines[-1]:  # of a run on recordings
-        return Training(blocks, None, None)
+        return Training(blocks, coped, None, None)
     played = sum(_block_episodes(line, run.settings) for line in lines)
-    return Training(blocks, int(lines[-1]["episodes"]), played)
+    return Training(blocks, coped, int(lines[-1]["episodes"]), played)
+
+
+def _victims(line: Mapping[str, Any]) -> list[str]:
+    """The keys of a block's success with one robot crashed."""
+    return [key for key in line if key.startswith("success_") and key.endswith("_crashed")]
+
+
+def _copes(line: Mapping[str, Any]) -> bool | None:
+    """None for a block that did not test each robot crashed, or not crash-free."""
+    victims = _victims(line)
+    rates = [line.get(key) for key in (CRASH_FREE, *victims)]
+    if not victims or any(rate is None for rate in rates):
+        return None
+    return min(float(rate) for rate in rates if rate is not None) >= COPES
 
 
 def _steps(line: Mapping[str, Any]) -> int:
@@ -67,5 +86,4 @@ def _block_episodes(line: Mapping[str, Any], settings: Mapping[str, Any]) -> int
     count = int(settings["test_episodes"])
     if settings.get("test_crash_free") and line.get("block_crashed"):
         count *= 2
-    victims = sum(key.startswith("success_") and key.endswith("_crashed") for key in line)
-    return count + victims * int(settings.get("test_victim_episodes") or 0)
+    return count + len(_victims(line)) * int(settings.get("test_victim_episodes") or 0)

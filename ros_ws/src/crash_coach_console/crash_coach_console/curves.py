@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from crash_coach_common.natural import natural
 from policy_pkg.checkpoint import split_best
 from policy_pkg.report.finished_runs import read_text
 from policy_pkg.train.run_dir import METRICS
@@ -67,7 +68,7 @@ def curves_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
     every = max(1, math.ceil(len(rows) / MOST_POINTS))
     kept = rows[::-1][::every][::-1]
     by_victim = {n for row in kept for n in row if _OF_VICTIM.fullmatch(n)}
-    names = (*_RATES, *sorted(by_victim))
+    names = (*_RATES, *sorted(by_victim, key=natural))
     series = {name: [_number(row.get(name)) for row in kept] for name in names}
     return {
         "unit": key,

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from crash_coach_common.natural import natural
 from policy_pkg.statistics import mean_interval, wilson
 
 SETTLE_S = 0.5
@@ -80,16 +81,10 @@ class EpisodeBook:
             _, episode, success, episode_return, steps = self._ended.popleft()
             self._settled = max(self._settled, episode)
             faults = self._faulted.pop(episode, set())
-            crashed = tuple(sorted({robot for robot, _ in faults}, key=_natural))
+            crashed = tuple(sorted({robot for robot, _ in faults}, key=natural))
             modes = tuple(sorted({mode for _, mode in faults}))
             self._faulted = {k: v for k, v in self._faulted.items() if k > episode}
             yield Played(episode, crashed, modes, success, episode_return, steps)
-
-
-def _natural(name: str) -> tuple[str, int]:
-    """robot_2 before robot_10."""
-    stem = name.rstrip("0123456789")
-    return stem, int(name[len(stem) :] or 0)
 
 
 @dataclass
@@ -126,7 +121,10 @@ class Costs:
         """
         groups = self._groups
         if len(groups) <= MOST_GROUPS:
-            order = sorted(groups, key=lambda k: (len(k[0]), -len(groups[k].returns), k))
+            order = sorted(
+                groups,
+                key=lambda k: (len(k[0]), -len(groups[k].returns), [*map(natural, k[0])], k[1]),
+            )
             rows = [
                 {"crashed": list(k[0]), "modes": list(k[1]), **_summary([groups[k]])} for k in order
             ]

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from policy_pkg.report.coping import Coping, coping
 from policy_pkg.report.finished_runs import differences, last_metrics, wall_time_s
 from policy_pkg.report.kept_evaluations import Result
 from policy_pkg.report.paired import PairedDifference, paired_differences
@@ -30,6 +31,7 @@ class Findings:
     rows: Sequence[Row]
     paired: Sequence[PairedDifference]
     costs: Sequence[Cost]
+    coping: Sequence[Coping]
     improvements: Sequence[Improvement]
     profiles: Sequence[Profile]
     runs: Sequence[Mapping[str, Any]]
@@ -46,6 +48,7 @@ class Findings:
             rows=found,
             paired=paired_differences(found, about["against"]),
             costs=costs(found),
+            coping=coping(results),
             improvements=improvements(found),
             profiles=profiles(found),
             runs=[describe(result) for result in results],
@@ -59,6 +62,7 @@ class Findings:
             "rows": [asdict(row) for row in self.rows],
             "paired_differences": [asdict(each) for each in self.paired],
             "costs": [asdict(each) for each in self.costs],
+            "coping": [asdict(each) for each in self.coping],
             "improvements": [asdict(each) for each in self.improvements],
             "thresholds": THRESHOLDS.tolist(),
             "profiles": [asdict(each) for each in self.profiles],

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from statistics import median
 from typing import Any
 
 from crash_coach_bringup.cli.markdown import table
 from crash_coach_bringup.cli.report.findings import Findings
+from policy_pkg.report.coping import Coping
 from policy_pkg.report.paired import LEAST_PAIRS, PairedDifference
 from policy_pkg.report.rows import ALL_MAPS, Improvement, Row, best
+from policy_pkg.report.training import COPES, LAST_BLOCKS
 from policy_pkg.report.victims import Cost
-from policy_pkg.statistics import Estimate
+from policy_pkg.statistics import Estimate, wilson
 
 NONE = "–"
 IMPROVEMENT = (
@@ -25,6 +28,10 @@ VICTIMS = (
     "Success in % with this robot alone crashed and, in brackets, what that costs: how much lower "
     "it is than crash-free, in points; ± half the width of its 95 % interval. Who costs most, on "
     "average over the methods, comes first."
+)
+COPING = (
+    f"A block copes where the team succeeds in at least {COPES:.0%} of its episodes crash-free and "
+    "with each robot crashed. In brackets Wilson's interval (95 %) over seeds."
 )
 
 
@@ -46,6 +53,8 @@ def page(findings: Findings) -> str:
             parts += [f"### {name}", table(["method", *columns], lines)]
     if findings.costs:
         parts += ["## Who hurts most", VICTIMS, *_victims(findings.costs)]
+    if findings.coping:
+        parts += ["## When they cope", COPING, _coping(findings.coping)]
     if about["against"]:
         parts += ["## Differences", *_differences(findings.paired)]
     if findings.improvements:
@@ -148,6 +157,23 @@ def _victims(costs: Sequence[Cost]) -> list[str]:
         lines = [[v, *(cells.get(m, NONE) for m in methods)] for v, cells in victims.items()]
         out += [f"### {name}", table(["crashed", *methods], lines)]
     return out
+
+
+def _coping(found: Sequence[Coping]) -> str:
+    lines = []
+    for each in found:
+        seeds, ended = len(each.seeds), sum(each.at_end)
+        steps = sorted(s for s in each.first_steps if s is not None)
+        first = NONE
+        if steps:
+            first = f"{steps[0]:,} to {steps[-1]:,}, median {round(median(steps)):,}"
+        if never := seeds - len(steps):
+            first = "never" if never == seeds else f"{first}; {never} never"
+        around = f"{ended} of {seeds} ({span(wilson(ended, seeds))})"
+        last = f"{sum(each.last)} of {each.last_blocks}"
+        lines.append([each.scenario, each.method, around, last, first])
+    columns = ["at the end", f"in the last {LAST_BLOCKS} blocks", "first, steps"]
+    return table(["map", "method", *columns], lines)
 
 
 def _improvements(better: Sequence[Improvement]) -> str:

@@ -32,7 +32,7 @@ from crash_coach_bringup.cli.output import (
     console,
     written_first,
 )
-from policy_pkg.report.finished_runs import read_text
+from policy_pkg.report.finished_runs import read_text, runs_below
 from policy_pkg.train.run_dir import METRICS, RUN
 
 if TYPE_CHECKING:
@@ -193,7 +193,7 @@ def _curve_json(curve: Curve, steps: str) -> dict[str, list[float] | None]:
 
 def runs_in(given: Path) -> list[Path]:
     """``given``, or the runs in it that have begun, if it is a folder of such."""
-    inside = [] if (given / RUN).is_file() else sorted(p.parent for p in given.glob(f"*/{RUN}"))
+    inside = [] if (given / RUN).is_file() else runs_below(given)
     begun = [path for path in inside if read_text(path / METRICS) is not None]
     return begun or [given]
 
