@@ -12,7 +12,7 @@ CODE := sim_pkg policy_pkg crash_coach_pkg ros_ws/src/crash_coach_common ros_ws/
     ros_ws/src/crash_coach_console tests benchmarks scripts examples
 PAGE := ros_ws/src/crash_coach_console/crash_coach_console/web
 
-.PHONY: help setup check test demo bench soak ray mlflow environments format lock clean
+.PHONY: help setup check test demo bench soak ray mlflow torchrl environments format lock clean
 
 help: ## this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -38,7 +38,7 @@ demo: setup ## train two teams, run them as ROS graphs, crash robots, read off t
 bench: setup ## every benchmark, to runs/bench.json
 	$(IN_ENV) python -m benchmarks
 
-soak: setup ray mlflow environments ## fuzz, kill and latency tests at full size
+soak: setup ray mlflow torchrl environments ## fuzz, kill and latency tests at full size
 	$(IN_ENV) $(PYTEST) -m soak --timeout 3600
 
 ray: setup ## the extra that `crash-coach sweep --engine ray` needs
@@ -46,6 +46,9 @@ ray: setup ## the extra that `crash-coach sweep --engine ray` needs
 
 mlflow: setup ## the extra that the logger mlflow needs
 	@.venv/bin/uv pip install --quiet --python .venv/bin/python -r requirements-mlflow.lock
+
+torchrl: setup ## the extra that examples/qmix_in_torchrl.py needs
+	@.venv/bin/uv pip install --quiet --python .venv/bin/python -r requirements-torchrl.lock
 
 environments: setup ## PettingZoo environments of others that the documents train on
 	@.venv/bin/uv pip install --quiet --python .venv/bin/python -r requirements-environments.lock
@@ -60,6 +63,8 @@ lock: setup ## requirements.in -> requirements.lock, and the extras'
 	    -c requirements.lock requirements-ray.in -o requirements-ray.lock
 	.venv/bin/uv pip compile --quiet --universal --no-header --python-version 3.11 \
 	    -c requirements.lock -c requirements-ray.lock requirements-mlflow.in -o requirements-mlflow.lock
+	.venv/bin/uv pip compile --quiet --universal --no-header --python-version 3.11 \
+	    -c requirements.lock -c requirements-mlflow.lock requirements-torchrl.in -o requirements-torchrl.lock
 	.venv/bin/uv pip compile --quiet --universal --no-header --python-version 3.11 \
 	    -c requirements.lock requirements-environments.in -o requirements-environments.lock
 

@@ -42,7 +42,8 @@ def test_pettingzoos_own_tests(mode: str) -> None:
 
 def test_a_muted_agent_stays_and_infos_say_so() -> None:
     env = crashed()
-    env.reset(seed=1)
+    _, infos = env.reset(seed=1)
+    assert infos["slow-1"] == {"crashed": False, "executed_action": 1}
     start = dict(env.unwrapped.places)
     while env.agents:
         *_, infos = env.step(dict.fromkeys(env.agents, 2))
@@ -196,24 +197,27 @@ def test_the_example_shows_a_rate_that_rises_and_falls() -> None:
     assert any(later < before for before, later in pairwise(rates))
 
 
-def qmix(*arguments: str) -> list[str]:
-    """What the example of an EPyMARL-style loop prints."""
-    command = [sys.executable, ROOT / "examples/qmix_in_epymarl_style.py", *arguments]
+def qmix(example: str, *arguments: str) -> list[str]:
+    """What an example of a QMIX loop prints of its blocks."""
+    command = [sys.executable, ROOT / "examples" / example, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
+    return [line for line in done.stdout.splitlines() if line.startswith("episode ")]
 
 
 def test_the_qmix_example_runs() -> None:
-    lines = qmix("--episodes", "100")
+    lines = qmix("qmix_in_epymarl_style.py", "--episodes", "100")
     assert [line.split(":")[0] for line in lines] == ["episode 0", "episode 100"]
 
 
 @pytest.mark.soak
 @pytest.mark.timeout(1000)
-def test_the_qmix_example_learns_while_agents_crash() -> None:
+@pytest.mark.parametrize("example", ["qmix_in_epymarl_style.py", "qmix_in_torchrl.py"])
+def test_a_qmix_example_learns_while_agents_crash(example: str) -> None:
     """As docs/wrappers.md says."""
-    lines = qmix()
+    if "torchrl" in example:
+        pytest.importorskip("torchrl", reason="make torchrl installs it")
+    lines = qmix(example)
     success, rate = (float(lines[-1].split(word)[1].split()[0].rstrip(",")) for word in (
         "success ", "next crash rate "
     ))  # fmt: skip

@@ -28,8 +28,9 @@ class CrashWrapper(BaseParallelWrapper):  # type: ignore[misc]
 
     Observations, rewards and ends are the environment's own. ``infos`` of each agent additionally
     say ``crashed``, whether a fault was in force on it in this step, and ``executed_action``, which
-    a learner has to learn from. Agents of the faults are numbered as in ``possible_agents``; in
-    ``coach`` they are called by their names, with ``_`` for what is neither letter nor digit.
+    a learner has to learn from (after ``reset``: False, and the stay action). Agents of the faults
+    are numbered as in ``possible_agents``; in ``coach`` they are called by their names, with ``_``
+    for what is neither letter nor digit.
 
     Args:
         env: with Discrete actions, and for faults of observations with Box observations (or a dict
@@ -115,7 +116,9 @@ class CrashWrapper(BaseParallelWrapper):  # type: ignore[misc]
         self._faults = TeamFaults(plan, len(self._agents_of_plan))
         self._step, self._return = 0, 0.0
         self.worst_actions = {}
-        return self._seen(observations, infos), self._told(infos, {})
+        # The keys that each step has: TorchRL takes from the first infos which there are.
+        idle = {"crashed": False, "executed_action": self._stay}
+        return self._seen(observations, infos), self._told(infos, dict.fromkeys(infos, idle))
 
     def step(self, actions: dict[Any, int]) -> Any:
         """One step, in which crashed agents do what their faults say."""
