@@ -32,7 +32,7 @@ KEYS = {
 # rosdep knows none of these: they come from requirements.lock alone.
 WITHOUT_KEY = {
     "imageio_ffmpeg", "lz4", "mcap", "mlflow", "onnx", "pettingzoo", "pymunk", "ray", "safetensors",
-    "starlette", "threadpoolctl", "zstandard",
+    "sqlalchemy", "starlette", "threadpoolctl", "zstandard",
 }  # fmt: skip
 ROS = {
     "ament_index_python", "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "launch",

@@ -14,6 +14,7 @@ from rclpy.node import Node
 from crash_coach_common.contract import UserError
 from crash_coach_common.ros.peers import several
 from crash_coach_common.ros.qos import BLOCKS, EPISODE, EVENTS, PLAN
+from crash_coach_common.ros.qos_node import QosNode, overrides
 from crash_coach_common.ros.run_node import TICK_S
 from crash_coach_pkg.coach.live_coach import Control
 from crash_coach_pkg.plan import CrashPlan
@@ -36,7 +37,7 @@ ENDLESS = Played(episode=0, ended=False, success=False)
 NAME = "_coach_link"  # a name that begins so is hidden from `ros2 node list` and `ros2 param list`
 
 
-class CoachLink(Node):
+class CoachLink(QosNode):
     """``changed`` guards ``control`` and what the gate answered.
 
     Args:
@@ -58,6 +59,7 @@ class CoachLink(Node):
             context=coach.context,
             # Namespace and remapping of the process count; a new name for /coach does not.
             cli_args=["--ros-args", "-r", f"__node:={NAME}"],
+            parameter_overrides=overrides(coach),
             start_parameter_services=False,
             enable_rosout=False,
         )

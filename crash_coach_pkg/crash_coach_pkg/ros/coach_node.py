@@ -32,6 +32,7 @@ from crash_coach_common.ros.parameters import (
     choices_text,
     refuse_undeclared,
 )
+from crash_coach_common.ros.qos_node import QosNode
 from crash_coach_common.ros.run_node import SPIN_S, spin
 from crash_coach_pkg.coach.coach import Planner
 from crash_coach_pkg.coach.config import TeamSpec
@@ -59,7 +60,7 @@ from crash_coach_pkg.ros.endpoints import leaves_observations
 from crash_coach_pkg.ros.robot_names import robot_names
 
 
-class CoachNode(Node):
+class CoachNode(QosNode):
     """Parameters and services. Put ``link`` on an executor and call ``start``.
 
     Raises:

@@ -13,7 +13,6 @@ from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.event_handler import PublisherEventCallbacks
-from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from crash_coach_common.contract import UserError
@@ -24,6 +23,7 @@ from crash_coach_common.ros.parameters import (
 )
 from crash_coach_common.ros.peers import several
 from crash_coach_common.ros.qos import EVENTS, PLAN
+from crash_coach_common.ros.qos_node import QosNode
 from crash_coach_common.ros.run_node import TICK_S
 from crash_coach_pkg.gate.health import Decided, Report, RobotState, TeamHealth
 from crash_coach_pkg.gate.plan_book import Event, EventKind, PlanBook
@@ -76,7 +76,7 @@ class Gate(Protocol):
     def close(self) -> None: ...
 
 
-class GateBase(Node):
+class GateBase(QosNode):
     """Parameters: robots, command_type, cmd_timeout_s, and those of RobotTopics.
 
     What is attached declares its own, before ``serve`` refuses those that nobody declared.

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from rclpy.context import Context
-from rclpy.node import Node
 
 from crash_coach_common.contract import UserError
+from crash_coach_common.ros.qos_node import QosNode
 from crash_coach_common.ros.run_node import run, serving
 from crash_coach_common.ros.team_topics import COMMANDS, OBSERVATIONS, TeamPublisher, subscribe
 from crash_coach_common.team_cdr import RobotMessage
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from policy_pkg.play.scripted_agent import ScriptedAgent
 
 
-class AgentNode(Node):
+class AgentNode(QosNode):
     """Acts on /<robot>/<observation_topic>, answers on /<robot>/<command_topic>.
 
     Raises:

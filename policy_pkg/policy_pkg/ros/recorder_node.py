@@ -13,11 +13,11 @@ from ament_index_python.packages import PackageNotFoundError, get_package_share_
 from crash_coach_interfaces.msg import Action, CrashPlan, EpisodeState, FaultEvent, Observation
 from nav_msgs.msg import Odometry
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from crash_coach_common.contract import UserError
+from crash_coach_common.ros.qos_node import QosNode
 from crash_coach_common.ros.run_node import run, serving
 from policy_pkg.bags.about import About
 from policy_pkg.bags.recorder import Recorder
@@ -39,7 +39,7 @@ _CLASSES = {
 }  # fmt: skip
 
 
-class RecorderNode(Node):
+class RecorderNode(QosNode):
     """Subscribes to serialized messages and hands them on; see docs/bags.md.
 
     Raises:

@@ -9,10 +9,10 @@ from enum import Enum
 from crash_coach_interfaces.msg import FaultEvent
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
 from crash_coach_common.contract import UserError
+from crash_coach_common.ros.qos_node import QosNode
 from crash_coach_common.ros.run_node import run, serving
 from crash_coach_common.team_cdr import RobotMessage
 from sim_pkg.env import make_env
@@ -37,7 +37,7 @@ class _Phase(Enum):
     DONE = "done"
 
 
-class SimNode(Node):
+class SimNode(QosNode):
     """See ROS.md and docs/ros.md for the protocol. ``done`` or ``failure`` end the process.
 
     Raises:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+import subprocess
+import sys
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
@@ -127,15 +130,22 @@ def test_a_run_of_when_tensorboard_was_the_only_logger_goes_on(tmp_path: Path) -
     assert train(config, run, resume=True).steps == 300
 
 
-@needs_mlflow
-def test_mlflow_keeps_configuration_metrics_and_end(tmp_path: Path) -> None:
-    """Stopped, moved with the store beside it, resumed: one run of MLflow's."""
-    config = small(
-        loggers={"tensorboard": False, "mlflow": {"experiment": "mine"}}, total_steps=600
-    )
-    asked = iter([False] * 100 + [True])
+TOLD = {"tensorboard": False, "mlflow": {"experiment": "mine"}}
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a run that was stopped, and MLflow's store."""
+    pytest.importorskip("mlflow", reason="make mlflow installs it")
+    folder, asked = tmp_path_factory.mktemp("begun"), iter([False] * 100 + [True])
+    config = small(loggers=TOLD, total_steps=600)
     with pytest.raises(EndedEarly):
-        train(config, tmp_path / "a" / "run", stopped=lambda: next(asked))
+        train(config, folder / "run", stopped=lambda: next(asked))
+    return folder
+
+
+def test_mlflow_keeps_configuration_metrics_and_end(begun: Path, tmp_path: Path) -> None:
+    """Stopped, moved with the store beside it, resumed: one run of MLflow's."""
     from mlflow.tracking import MlflowClient
 
     def found(folder: Path) -> Any:
@@ -144,10 +154,10 @@ def test_mlflow_keeps_configuration_metrics_and_end(tmp_path: Path) -> None:
         (run,) = client.search_runs([experiment.experiment_id])
         return client, run
 
-    _, run = found(tmp_path / "a")
+    _, run = found(begun)
     assert run.info.status == "KILLED"
-    (tmp_path / "a").rename(tmp_path / "b")
-    train(config, tmp_path / "b" / "run", resume=True)
+    shutil.copytree(begun, tmp_path / "b")
+    train(small(loggers=TOLD, total_steps=600), tmp_path / "b" / "run", resume=True)
     client, again = found(tmp_path / "b")
     assert (again.info.run_id, again.info.status) == (run.info.run_id, "FINISHED")
     assert again.info.run_name == "run"
@@ -162,14 +172,35 @@ def test_mlflow_keeps_configuration_metrics_and_end(tmp_path: Path) -> None:
 
 
 @needs_mlflow
-def test_a_store_that_lost_the_run_and_one_that_cannot_be_are_named(tmp_path: Path) -> None:
-    told = {"tensorboard": False, "mlflow": {"tracking_uri": "nothing://here"}}
+@pytest.mark.soak
+def test_runs_that_begin_side_by_side_share_a_store(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "crash_coach_bringup.cli.main", "train", "buttons/qmix"]
+    command += ["--out", str(tmp_path), "--seed", "1", "2", "3", "--set", "loggers.mlflow=true"]
+    command += ["loggers.tensorboard=false", "total_steps=300", "test_episodes=2"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=280, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    from mlflow.tracking import MlflowClient
+
+    client = MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
+    runs = client.search_runs([client.get_experiment_by_name("crash-coach").experiment_id])
+    assert {(r.info.run_name, r.info.status) for r in runs} == {
+        (f"qmix-s{seed}", "FINISHED") for seed in (1, 2, 3)
+    }
+
+
+def test_a_store_that_lost_the_run_and_one_that_cannot_be_are_named(
+    begun: Path, tmp_path: Path
+) -> None:
+    def told(store: str) -> dict[str, Any]:
+        return {"tensorboard": False, "mlflow": {"tracking_uri": store}}
+
     with pytest.raises(UserError, match=r"loggers\.mlflow: MLflow's store nothing://here: "):
-        train(small(loggers=told), tmp_path / "a")
-    config = small(loggers={"tensorboard": False, "mlflow": True}, total_steps=300)
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "mlflow.json").write_text(json.dumps({"run_id": "0" * 32}))
-    start = Start(tmp_path / "run", {}, {}, 300)
-    chosen = loggers.Chosen(config.loggers)
+        train(small(loggers=told("nothing://here")), tmp_path / "a")
+    nowhere = f"sqlite:///{tmp_path}/no/folder/mlflow.db"
+    with pytest.raises(UserError, match=r"MLflow's store sqlite:///.*mlflow\.db: .*No such file"):
+        train(small(loggers=told(nowhere)), tmp_path / "b")
+    shutil.copytree(begun, tmp_path / "moved")
+    run = tmp_path / "moved" / "run"
+    (run / "mlflow.json").write_text(json.dumps({"run_id": "0" * 32}))
     with pytest.raises(UserError, match=r"has no run 0{32}, which .*mlflow\.json says this run is"):
-        chosen.begin(start)
+        train(small(loggers=TOLD, total_steps=600), run, resume=True)

@@ -76,7 +76,7 @@ def test_a_killed_coach_leaves_no_fault_behind(ros_env: dict[str, str]) -> None:
         while g.team.step(0, step)[0].faulted:
             step += 1
         freed_s = time.monotonic() - killed
-        assert freed_s < lease_s + 0.5  # the machine may be busy
+        assert freed_s < lease_s + 10  # the machine may be busy
         assert FaultEvent.EXPIRED in g.team.kinds()
         # The next episodes need no plan: nobody holds them.
         for episode in (1, 2):

@@ -72,7 +72,7 @@ def inject_and_clear(g: Graph, stream: Stream, victim: int, mode: str) -> None:
             assert outcome.faulted, f"{mode} is late: injected at {injected}, {key} is not faulted"
         if key > cleared or robot != victim:
             assert not outcome.faulted, f"{key} robot {robot} is faulted, cleared at {cleared}"
-    for key in [key for key in g.team.outcomes if key[:2] <= cleared]:
+    for key in [key for key in list(g.team.outcomes) if key[:2] <= cleared]:
         del g.team.outcomes[key]
 
 

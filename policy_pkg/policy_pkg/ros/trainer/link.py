@@ -13,10 +13,10 @@ from functools import partial
 from crash_coach_interfaces.msg import BlockResult, EpisodeState, PolicyStatus
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
-from rclpy.node import Node
 
 from crash_coach_common.contract import EnvSpec, UserError
 from crash_coach_common.ros.greet import greet
+from crash_coach_common.ros.qos_node import QosNode
 from policy_pkg.bags.dataset import RecordedEpisode
 from policy_pkg.ros.trainer.topics import Heard, RobotMessages, TrainerTopics
 from policy_pkg.train.live.inbox import Inbox, Lost
@@ -69,7 +69,7 @@ class GraphLink:
         self._context = Context()
         # The process's own arguments: namespace and remapping count on every domain.
         self._context.init(domain_id=graph.domain)
-        self._node = Node(
+        self._node = QosNode(
             "trainer",
             context=self._context,
             start_parameter_services=False,

@@ -6,7 +6,7 @@ import json
 import os
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field
 
 from crash_coach_common.contract import UserError
+from crash_coach_common.locks import TakenError, held
 from crash_coach_common.strict_yaml import StrictModel
 from crash_coach_common.whole_output import write_whole
 from policy_pkg.train.loggers.base import ExperimentLogger, Start, Status
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 KEPT = "mlflow.json"  # in the run's folder: which run of MLflow's it is
 STORE = "mlflow.db"
+SQLITE = "sqlite:///"
+MADE_S = 300.0  # how long another process may take to make a store
 PARAMETERS_AT_ONCE = 100  # MLflow takes no more in one call
 STATUS: Mapping[Status, str] = {"finished": "FINISHED", "stopped": "KILLED", "failed": "FAILED"}
 # Read when MLflow is imported. Nothing is sent to its makers, its migrations are not told of, and a
@@ -72,25 +75,34 @@ class Mlflow(ExperimentLogger):
         from mlflow.entities import Metric, Param
         from mlflow.exceptions import MlflowException
         from mlflow.tracking import MlflowClient
+        from sqlalchemy.exc import SQLAlchemyError
 
-        self._metric, self._param, self._error = Metric, Param, MlflowException
+        self._metric, self._param = Metric, Param
+        self._error, self._errors = MlflowException, (MlflowException, SQLAlchemyError)
         store = options.tracking_uri or os.environ.get("MLFLOW_TRACKING_URI")
-        self._store = store or f"sqlite:///{start.out_dir.resolve().parent / STORE}"
+        self._store = store or f"{SQLITE}{start.out_dir.resolve().parent / STORE}"
         kept = start.out_dir / KEPT
         try:
-            with self._as_os_error():
+            with self._alone(), self._as_os_error():
                 self._client = MlflowClient(tracking_uri=self._store)
                 self._run = self._again(kept) if kept.exists() else self._begin(start, options)
-        except OSError as error:
+        except (OSError, TakenError) as error:
             raise UserError(f"MLflow's store {self._store}: {error}") from error
         write_whole(kept, (json.dumps({"run_id": self._run}) + "\n").encode())
+
+    def _alone(self) -> AbstractContextManager[None]:
+        """While a store in a file is made: MLflow lets two processes do so at once, which fails."""
+        if not self._store.startswith(SQLITE):
+            return nullcontext()
+        file = Path(self._store.removeprefix(SQLITE))
+        return held(file.with_name(f"{file.name}.lock"), MADE_S)
 
     @contextmanager
     def _as_os_error(self) -> Iterator[None]:
         try:
             yield
-        except self._error as error:
-            raise OSError(str(error)) from error
+        except self._errors as error:
+            raise OSError(str(error).partition("\n")[0]) from error
 
     def _begin(self, start: Start, options: MlflowOptions) -> str:
         about, name = start.about, options.experiment

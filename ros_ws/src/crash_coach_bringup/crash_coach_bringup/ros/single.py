@@ -18,7 +18,7 @@ from crash_coach_pkg.ros import coach_node, gate_node
 from policy_pkg.ros.team_node import TeamNode
 from sim_pkg.ros.sim_node import SimNode
 
-_OF_NODE = re.compile(r"(?P<node>\w+):(?P<name>[\w.]+):=(?P<value>.*)", re.DOTALL)
+_OF_NODE = re.compile(r"(?P<node>\w+):(?P<name>[\w./]+):=(?P<value>.*)", re.DOTALL)
 
 
 def main() -> int:

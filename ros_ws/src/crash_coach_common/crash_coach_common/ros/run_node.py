@@ -22,6 +22,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from crash_coach_common.caches import settle_caches
 from crash_coach_common.contract import UserError
+from crash_coach_common.ros.qos_node import tell_unused
 
 SPIN_S = 0.1  # how soon a signal is noticed
 TICK_S = 0.05  # steady timers for leases and heartbeats
@@ -83,6 +84,7 @@ class Serving:
 
     def until(self, done: Callable[[], object]) -> None:
         """Serves until ``done()``, which may raise what went wrong."""
+        tell_unused(self._nodes)
         gc.freeze()  # what was loaded so far stays: no collection need look at it again
         while not done():
             self.executor.spin_once(timeout_sec=SPIN_S)

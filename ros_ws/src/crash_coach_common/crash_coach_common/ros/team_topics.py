@@ -2,7 +2,8 @@
 
 Whoever listens to the team's hidden topic as well as to the robots' own needs each robot's message
 on only one of them. So a robot's message goes out on its own topic as soon as some other node
-listens to that, and with the rest of the team otherwise: every listener hears it once.
+listens to that, and with the rest of the team otherwise: every listener hears it once. Whoever has
+overridden the quality of service of a robot's own topic gets that topic.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from crash_coach_common.contract import UserError
 from crash_coach_common.ros.peers import UNKNOWN, full_name
 from crash_coach_common.ros.qos import NEWEST
+from crash_coach_common.ros.qos_node import overridden
 from crash_coach_common.team_cdr import RobotMessage, TeamCodec, action_end, observation_end
 
 NAMESPACE = "_team"  # hidden: a bag of all topics then has the robots' own, as bags always had
@@ -87,6 +89,7 @@ class TeamPublisher:
 
         self.robots = [(make or plain)(robot, events) for robot in range(len(robots))]
         """The publishers of their own topics."""
+        self._apart = {i for i, topic in enumerate(topics) if overridden(node, topic, "publisher")}
         self._alone = [publisher.publish for publisher in self.robots]
         self._topic = f"{NAMESPACE}/{name}"
         self._team = node.create_publisher(
@@ -126,7 +129,7 @@ class TeamPublisher:
             of_team = {_name(info) for info in found} - {None}
             for robot, topic in enumerate(self._topics):
                 of_robot = {*map(_name, self._node.get_subscriptions_info_by_topic(topic))}
-                if of_robot and of_robot <= of_team:
+                if of_robot and of_robot <= of_team and robot not in self._apart:
                     together.add(robot)
         self.together = frozenset(together)
 
@@ -175,11 +178,12 @@ def subscribe(
     def on_robot(robot: int, data: bytes) -> None:
         on_messages([(robot, data)])
 
-    # Each robot may have a publisher of its own.
-    qos = QoSProfile(depth=2 * len(robots))
-    if lockstep:
-        qos.reliability = ReliabilityPolicy.BEST_EFFORT
-    node.create_subscription(kind.team_type, f"{NAMESPACE}/{name}", on_team, qos, raw=True)
+    if not any(overridden(node, topic, "subscription") for topic in topics):
+        # Each robot may have a publisher of its own.
+        qos = QoSProfile(depth=2 * len(robots))
+        if lockstep:
+            qos.reliability = ReliabilityPolicy.BEST_EFFORT
+        node.create_subscription(kind.team_type, f"{NAMESPACE}/{name}", on_team, qos, raw=True)
     return [
         node.create_subscription(kind.robot_type, topic, partial(on_robot, robot), NEWEST, raw=True)
         for robot, topic in enumerate(topics)
