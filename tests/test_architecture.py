@@ -65,7 +65,7 @@ def allowed(package: str, path: Path, name: str) -> bool:
     if top in MESSAGES:
         return "ros" in inside[:-1]
     if top == "pymunk":
-        return path == PACKAGES["sim_pkg"] / "world.py"
+        return path == PACKAGES["sim_pkg"] / "chipmunk.py"
     if top == "torch":
         return package == "policy_pkg" and (inside[0] == "learner" or inside == TORCHSCRIPT)
     if top == "yaml":
@@ -112,7 +112,7 @@ def test_import_law() -> None:
         ("sim_pkg", "env.py", "crash_coach_common.contract", True),
         ("sim_pkg", "env.py", "crash_coach_common.ros.run_node", False),
         ("sim_pkg", "env.py", "pymunk", False),
-        ("sim_pkg", "world.py", "pymunk", True),
+        ("sim_pkg", "chipmunk.py", "pymunk", True),
         ("sim_pkg", "env.py", "rclpy", False),
         ("sim_pkg", "ros/sim_node.py", "rclpy.node", True),
         ("sim_pkg", "ros/sim_node.py", "crash_coach_common.ros.run_node", True),

@@ -29,10 +29,10 @@ KEYS = {
     "uvicorn": "python3-uvicorn",
     "yaml": "python3-yaml",
 }
-# rosdep knows none of these: they come from requirements.lock alone.
+# rosdep knows none of these: they come from requirements.lock alone, llvmlite also with numba.
 WITHOUT_KEY = {
-    "imageio_ffmpeg", "lz4", "mcap", "mlflow", "onnx", "pettingzoo", "pymunk", "ray", "safetensors",
-    "sqlalchemy", "starlette", "threadpoolctl", "zstandard",
+    "imageio_ffmpeg", "llvmlite", "lz4", "mcap", "mlflow", "onnx", "pettingzoo", "pymunk", "ray",
+    "safetensors", "sqlalchemy", "starlette", "threadpoolctl", "zstandard",
 }  # fmt: skip
 ROS = {
     "ament_index_python", "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "launch",

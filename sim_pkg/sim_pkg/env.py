@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from crash_coach_common.contract import (
     BoolArray,
@@ -18,6 +17,7 @@ from crash_coach_common.contract import (
     StepResult,
 )
 from crash_coach_common.strict_yaml import ConfigError, StrictModel, did_you_mean, validate
+from sim_pkg.compiled import entry
 from sim_pkg.foreign.config import KIND as FOREIGN
 from sim_pkg.scenario_files import scenario_names
 from sim_pkg.scenario_source import ScenarioSource, read_scenario
@@ -187,7 +187,7 @@ class Env:
             self._world.advance(running)
         out.clear_outcome()
         self._scenario.settle(running, self._world, out)
-        running &= ~(out.terminated | out.truncated)
+        _stop_ended(running, out.terminated, out.truncated)
         return self._result
 
     def _begin(self, arena: int, seed: int, episode: int) -> None:
@@ -220,7 +220,14 @@ class Env:
             )
 
 
-@njit(cache=True)
+@entry
+def _stop_ended(running, terminated, truncated):  # type: ignore[no-untyped-def]
+    for b in range(running.shape[0]):
+        if terminated[b] or truncated[b]:
+            running[b] = False
+
+
+@entry
 def _first_unavailable(running, actions, available):  # type: ignore[no-untyped-def]
     """Flat (arena, robot) index of the first action that is not allowed, or -1."""
     n_actions = available.shape[2]

@@ -5,15 +5,14 @@ Chipmunk notices two discs only when they overlap already, up to a substep's way
 before the physics: in one phase no pair comes closer than touching. The units brake, as a robot
 with a proximity sensor does, and are not pushed: who stands stays.
 
-Shapes and columns as in tables.py. Helpers are inlined where the call, which hands over
-every array, costs more than they do.
+Shapes and columns as in tables.py.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from sim_pkg.compiled import entry, helper
 from sim_pkg.scenarios.skirmish.tables import ALIVE, BODY_RADIUS_M, SPEED_MPS
 
 SLIDE_PASSES, SHRINK_PASSES = 3, 8
@@ -22,7 +21,7 @@ SLIDE_PASSES, SHRINK_PASSES = 3, 8
 FIRST, SECOND, X, Y, DISTANCE, TOUCH, PAIR_COLUMNS = range(7)
 
 
-@njit(cache=True)
+@entry
 def brake(running, phase_s, bodies, units, free, whole, commands):  # type: ignore[no-untyped-def]
     """Limits the velocities of everyone for a phase, in place."""
     d = units.shape[0]
@@ -43,7 +42,7 @@ def brake(running, phase_s, bodies, units, free, whole, commands):  # type: igno
             commands[b, i, 1] = now[i, 3]
 
 
-@njit(cache=True)
+@helper
 def _pair_up(b, phase_s, units, whole, now, pairs):  # type: ignore[no-untyped-def]
     """How many pairs are near enough to meet in this phase."""
     near = 0
@@ -71,7 +70,7 @@ def _pair_up(b, phase_s, units, whole, now, pairs):  # type: ignore[no-untyped-d
     return near
 
 
-@njit(cache=True)
+@helper
 def _settle(near, phase_s, units, free, now, pairs):  # type: ignore[no-untyped-def]
     """Slows approaching pairs so that, if they keep their velocities, they just touch.
 
@@ -89,7 +88,7 @@ def _settle(near, phase_s, units, free, now, pairs):  # type: ignore[no-untyped-
     _brake_at_walls(phase_s, units, free, now)
 
 
-@njit(cache=True, inline="always")
+@helper
 def _brake_pair(pair, slide, phase_s, now, pairs):  # type: ignore[no-untyped-def]
     """Whether the two had to brake, in proportion to what each contributes to the approach."""
     i, k = int(pairs[pair, FIRST]), int(pairs[pair, SECOND])
@@ -116,7 +115,7 @@ def _brake_pair(pair, slide, phase_s, now, pairs):  # type: ignore[no-untyped-de
     return True
 
 
-@njit(cache=True, inline="always")
+@helper
 def _slow(i, slide, share, x, y, now):  # type: ignore[no-untyped-def]
     """Takes ``share`` off the part (x, y) of i's velocity, or off all of it."""
     if slide:
@@ -127,7 +126,7 @@ def _slow(i, slide, share, x, y, now):  # type: ignore[no-untyped-def]
         now[i, 3] *= 1.0 - share
 
 
-@njit(cache=True)
+@helper
 def _brake_at_walls(phase_s, units, free, now):  # type: ignore[no-untyped-def]
     for i in range(units.shape[0]):
         radius = units[i, BODY_RADIUS_M]

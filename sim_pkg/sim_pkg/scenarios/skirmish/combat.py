@@ -4,15 +4,14 @@ A phase's physics comes first; its ticks then see each unit on the straight line
 to where it is. All units act on the same instant: who dies in a tick still strikes in it, so both
 teams can lose their last unit at once.
 
-Shapes and columns as in tables.py. Helpers are inlined where the call, which hands over
-every array, costs more than they do.
+Shapes and columns as in tables.py.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from sim_pkg.compiled import entry, helper
 from sim_pkg.scenarios.skirmish.tables import (
     ALIVE,
     ARMOUR,
@@ -41,7 +40,7 @@ LEAST_DAMAGE = 0.5  # of a hit on health, however thick the armour (StarCraft II
 ROUNDING_S = 1e-9
 
 
-@njit(cache=True)
+@entry
 def fight(  # type: ignore[no-untyped-def]
     running, ticks, tick_s, bodies, units, hits_s, damage, reach, extras_s, clock_s, real, whole,
     hits,
@@ -73,7 +72,7 @@ def fight(  # type: ignore[no-untyped-def]
     return deaths
 
 
-@njit(cache=True, inline="always")
+@helper
 def _muster(b, units, real, whole, fighters, weak):  # type: ignore[no-untyped-def]
     """Lists who can strike in this phase and whose shield can grow; how many of each."""
     n_fighters, n_weak = 0, 0
@@ -89,7 +88,7 @@ def _muster(b, units, real, whole, fighters, weak):  # type: ignore[no-untyped-d
     return n_fighters, n_weak
 
 
-@njit(cache=True, inline="always")
+@helper
 def _recover(b, i, tick_s, clock_s, units, real, whole):  # type: ignore[no-untyped-def]
     quiet_s = clock_s - real[b, i, HURT]
     if quiet_s > units[i, SHIELD_AFTER_S] + ROUNDING_S and whole[b, i, ALIVE]:
@@ -97,7 +96,7 @@ def _recover(b, i, tick_s, clock_s, units, real, whole):  # type: ignore[no-unty
         real[b, i, SHIELD] = min(more, units[i, MAX_SHIELD])
 
 
-@njit(cache=True, inline="always")
+@helper
 def _start(b, i, share, clock_s, bodies, units, reach, extras_s, real, whole):  # type: ignore[no-untyped-def]
     """Unit i starts an attack if it may and its target is within reach, ``share`` of the phase
     on."""
@@ -119,7 +118,7 @@ def _start(b, i, share, clock_s, bodies, units, reach, extras_s, real, whole):  
         whole[b, i, ATTACKS] = count + 1
 
 
-@njit(cache=True, inline="always")
+@helper
 def _strike(b, i, clock_s, units, hits_s, damage, real, whole, hits):  # type: ignore[no-untyped-def]
     """Whether any hit of the present attack landed."""
     landed = False
@@ -135,7 +134,7 @@ def _strike(b, i, clock_s, units, hits_s, damage, real, whole, hits):  # type: i
     return landed
 
 
-@njit(cache=True)
+@helper
 def _hit(b, victim, damage, clock_s, units, real):  # type: ignore[no-untyped-def]
     """What the victim loses: shield first, and what is left of the hit, less armour, health."""
     on_shield = min(damage, real[b, victim, SHIELD])
@@ -149,7 +148,7 @@ def _hit(b, victim, damage, clock_s, units, real):  # type: ignore[no-untyped-de
     return on_shield + on_health
 
 
-@njit(cache=True)
+@helper
 def _bury(b, real, whole):  # type: ignore[no-untyped-def]
     """Who has no health left is dead; attacks on the dead end, and an order to attack one.
 

@@ -6,8 +6,8 @@ Shapes and columns as in tables.py.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from sim_pkg.compiled import entry, helper
 from sim_pkg.scenarios.skirmish.layout import (
     ATTACK_M,
     FIRST_ATTACK,
@@ -35,7 +35,7 @@ REWARD_KILL, REWARD_WIN, REWARD_SUM = 10.0, 200.0, 20.0
 ROUNDING_M = 1e-9
 
 
-@njit(cache=True)
+@entry
 def score(  # type: ignore[no-untyped-def]
     running, n, limit, full, real, whole, steps, standing, reward, terminated, success
 ):
@@ -62,23 +62,11 @@ def score(  # type: ignore[no-untyped-def]
         terminated[b] = living == 0 or robots == 0 or steps[b] >= limit
 
 
-@njit(cache=True)
+@entry
 def observe(  # type: ignore[no-untyped-def]
-    running,
-    n,
-    shields,
-    bodies,
-    units,
-    types,
-    free,
-    arena_m,
-    clock_s,
-    real,
-    whole,
-    obs,
-    state,
+    running, n, bodies, units, real, whole, clock_s, shields, types, free, arena_m, obs, state,
     available,
-):
+):  # fmt: skip
     """``shields``: whether features for the robots', the opponents' shields exist."""
     d = units.shape[0]
     now = np.empty((d, 4))  # x, y, health, shield as a share of the full one
@@ -104,7 +92,7 @@ def observe(  # type: ignore[no-untyped-def]
                 available[b, i, NO_OP] = True
 
 
-@njit(cache=True)
+@helper
 def _free_ways(b, i, now, units, free, obs, available):  # type: ignore[no-untyped-def]
     """A move is available if half its way is free of walls, as in SMAC."""
     available[b, i, STOP] = True
@@ -118,7 +106,7 @@ def _free_ways(b, i, now, units, free, obs, available):  # type: ignore[no-untyp
             obs[b, i, k] = 1.0
 
 
-@njit(cache=True)
+@helper
 def _look(b, i, n, shields, now, types, whole, obs, available):  # type: ignore[no-untyped-def]
     """Opponents, allies and oneself, from column 4 on; and which attacks are available."""
     at = 4
@@ -154,7 +142,7 @@ def _look(b, i, n, shields, now, types, whole, obs, available):  # type: ignore[
         obs[b, i, at + 1 + shields[0] + t] = types[i, t]
 
 
-@njit(cache=True)
+@helper
 def _state(b, n, shields, now, units, types, arena_m, clock_s, real, whole, state):  # type: ignore[no-untyped-def]
     for k in range(state.shape[1]):
         state[b, k] = 0.0

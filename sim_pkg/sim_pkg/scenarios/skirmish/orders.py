@@ -4,15 +4,14 @@ Before the physics of a phase each unit gets a velocity: to the point it was ord
 towards its target until that is within reach. Whoever has something in the way goes around it, on
 one side until the way is free. brake.py then keeps them from running into each other.
 
-Shapes and columns as in tables.py. Helpers are inlined where the call, which hands over
-every array, costs more than they do.
+Shapes and columns as in tables.py.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from sim_pkg.compiled import entry, helper
 from sim_pkg.scenarios.skirmish.layout import FIRST_ATTACK, MOVE_M, STOP
 from sim_pkg.scenarios.skirmish.tables import (
     ALIVE,
@@ -45,7 +44,7 @@ GONE_M = 1e9  # where the dead are: in nobody's way
 SAME_PACE = 0.8  # what goes the same way at this share of one's speed is not in the way
 
 
-@njit(cache=True)
+@entry
 def take_orders(running, actions, bodies, real, whole):  # type: ignore[no-untyped-def]
     """The robots' actions (B, n) as orders. An attack that has not hit yet is broken off by any
     other order, and may start again at once."""
@@ -76,7 +75,7 @@ def take_orders(running, actions, bodies, real, whole):  # type: ignore[no-untyp
             unit[TARGET] = target
 
 
-@njit(cache=True)
+@entry
 def drive(  # type: ignore[no-untyped-def]
     running, n, phase_s, bodies, units, reach, acquire, leash, habits, goal, real, whole, commands
 ):
@@ -110,7 +109,7 @@ def drive(  # type: ignore[no-untyped-def]
             commands[b, i, 1] = vy
 
 
-@njit(cache=True)
+@helper
 def _choose_target(  # type: ignore[no-untyped-def]
     b, n, j, phase_s, now, reach, acquire, leash, habits, goal, real, whole
 ):
@@ -137,7 +136,7 @@ def _choose_target(  # type: ignore[no-untyped-def]
         real[b, j, POINT_Y] = goal[1]
 
 
-@njit(cache=True)
+@helper
 def _look_around(b, n, j, now, acquire, help_m, whole):  # type: ignore[no-untyped-def]
     """The nearest robot within j's range, else one that hit j or a neighbour of j; -1: none."""
     best, nearest = np.inf, -1
@@ -158,7 +157,7 @@ def _look_around(b, n, j, now, acquire, help_m, whole):  # type: ignore[no-untyp
     return nearest
 
 
-@njit(cache=True, inline="always")
+@helper
 def _wish(b, i, phase_s, now, units, reach, real, whole):  # type: ignore[no-untyped-def]
     """The velocity with which unit i would follow its order if it were alone but for detours."""
     order = whole[b, i, ORDER]
@@ -189,7 +188,7 @@ def _wish(b, i, phase_s, now, units, reach, real, whole):  # type: ignore[no-unt
     return speed * dx, speed * dy
 
 
-@njit(cache=True, inline="always")
+@helper
 def _around(b, i, target, dx, dy, speed, now, whole):  # type: ignore[no-untyped-def]
     """The direction (dx, dy), or along the edge of the unit that is in the way."""
     most, blocked_x, blocked_y = AHEAD, 0.0, 0.0
@@ -219,7 +218,7 @@ def _around(b, i, target, dx, dy, speed, now, whole):  # type: ignore[no-untyped
     return -side * blocked_y, side * blocked_x
 
 
-@njit(cache=True, inline="always")
+@helper
 def _distance(now, i, k):  # type: ignore[no-untyped-def]
     x, y = now[k, 0] - now[i, 0], now[k, 1] - now[i, 1]
     return np.sqrt(x * x + y * y)

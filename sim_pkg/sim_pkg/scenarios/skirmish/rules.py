@@ -14,7 +14,7 @@ when no robot lives, also where the last of both teams die at once, or at ``epis
 
 The files: layout.py says where everything is in observations, state and actions;
 config.py what a map and a unit type may say; tables.py holds both as arrays;
-orders.py, brake.py, combat.py and observe.py are compiled.
+orders.py, brake.py, combat.py and observe.py are compiled, and phases.py, which joins them.
 
 Chance is in the starts (``jitter_m``) and in a random extra on the cooldown of every attack: the
 k-th attack of a unit draws the k-th number of a table. Both depend on (seed, episode) alone.
@@ -26,7 +26,7 @@ import numpy as np
 
 from crash_coach_common.contract import BoolArray, EnvSpec, FloatArray, IntArray
 from sim_pkg.scenarios.base import Actor, Buffers, Kind, Scene, Side, episode_rng, robot_names
-from sim_pkg.scenarios.skirmish import brake, combat, observe, orders
+from sim_pkg.scenarios.skirmish import observe, phases
 from sim_pkg.scenarios.skirmish.config import PHASES, TICK_S, SkirmishConfig
 from sim_pkg.scenarios.skirmish.layout import (
     NO_OP,
@@ -57,11 +57,8 @@ class Skirmish:
         self._hits = np.zeros((n_arenas, d, d), dtype=np.float32)
         # Whose disc still collides.
         self._inside = np.zeros((n_arenas, d), dtype=np.bool_)
-        self._phase_s = config.dt_s / PHASES
         self._phase = 0
-        self._habits = (config.behaviour.help_m, config.behaviour.patience_s)
-        health, count = tables.standing
-        self._full_reward = health + observe.REWARD_KILL * count + observe.REWARD_WIN
+        self._gather_arguments()
         self.spec = EnvSpec(
             scenario=name,
             robots=robot_names(self._n),
@@ -86,6 +83,25 @@ class Skirmish:
         )
         self.world = _world(config)
 
+    def _gather_arguments(self) -> None:
+        """For phases.py, by what needs them: every call, fighting, moving, scoring and seeing."""
+        config, tables, fight = self.config, self._tables, self._fight
+        phase_s = config.dt_s / PHASES
+        habits = (config.behaviour.help_m, config.behaviour.patience_s)
+        self._units = (tables.units, tables.reach_m, fight.real, fight.whole, self._hits)
+        self._fighting = (
+            round(phase_s / TICK_S), TICK_S, tables.hits_s, tables.damage, fight.extras_s,
+            fight.clock_s,
+        )  # fmt: skip
+        self._moving = (
+            phase_s, tables.acquire_m, tables.leash_m, habits, tables.goal_m, tables.free_m,
+        )  # fmt: skip
+        health, count = tables.standing
+        full_reward = health + observe.REWARD_KILL * count + observe.REWARD_WIN
+        self._scoring = (config.episode_limit, full_reward, fight.steps, fight.standing)
+        shields = (int(self.layout.robot_shields), int(self.layout.opponent_shields))
+        self._seeing = (shields, tables.type_bits, tables.free_m, config.arena_m)
+
     def _vitals(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         layout = self.layout
         parts = layout.split_state(state)
@@ -105,56 +121,34 @@ class Skirmish:
         return self._fight.begin(self._tables, arena, episode_rng(seed, episode))
 
     def observe(self, running: BoolArray, world: World, out: Buffers) -> None:
-        tables, fight, layout = self._tables, self._fight, self.layout
-        shields = (int(layout.robot_shields), int(layout.opponent_shields))
+        fight = self._fight
         observe.observe(
-            running, self._n, shields, world.bodies, tables.units, tables.type_bits,
-            tables.free_m, self.config.arena_m, fight.clock_s, fight.real, fight.whole, out.obs,
-            out.state, out.available,
+            running, self._n, world.bodies, self._tables.units, fight.real, fight.whole,
+            fight.clock_s, *self._seeing, out.obs, out.state, out.available,
         )  # fmt: skip
 
     def command(self, running: BoolArray, actions: IntArray, world: World) -> None:
-        tables, fight = self._tables, self._fight
-        if self._phase == 0:
-            orders.take_orders(running, actions, world.bodies, fight.real, fight.whole)
-            self._hits[:] = 0.0
-        else:
-            self._fight_on(running, world)
+        if phases.move(
+            self._phase == 0, running, actions, self._n, world.bodies, *self._units,
+            *self._fighting, *self._moving, world.commands,
+        ):  # fmt: skip
+            self._take_out_the_dead(running, world)
         self._phase += 1
-        orders.drive(
-            running, self._n, self._phase_s, world.bodies, tables.units, tables.reach_m,
-            tables.acquire_m, tables.leash_m, self._habits, tables.goal_m, fight.real, fight.whole,
-            world.commands,
-        )  # fmt: skip
-        brake.brake(
-            running, self._phase_s, world.bodies, tables.units, tables.free_m, fight.whole,
-            world.commands,
-        )  # fmt: skip
 
     def settle(self, running: BoolArray, world: World, out: Buffers) -> None:
-        fight = self._fight
-        self._fight_on(running, world)
         self._phase = 0
+        if phases.end(
+            running, self._n, world.bodies, *self._units, *self._fighting, *self._scoring,
+            out.reward, out.terminated, out.success, *self._seeing, out.obs, out.state,
+            out.available,
+        ):  # fmt: skip
+            self._take_out_the_dead(running, world)
         out.hits[:] = self._hits
-        observe.score(
-            running, self._n, self.config.episode_limit, self._full_reward, fight.real,
-            fight.whole, fight.steps, fight.standing, out.reward, out.terminated, out.success,
-        )  # fmt: skip
-        self.observe(running, world, out)
 
-    def _fight_on(self, running: BoolArray, world: World) -> None:
-        """The ticks of the phase that the physics has just been through."""
-        tables, fight = self._tables, self._fight
-        deaths = combat.fight(
-            running, round(self._phase_s / TICK_S), TICK_S, world.bodies, tables.units,
-            tables.hits_s, tables.damage, tables.reach_m, fight.extras_s, fight.clock_s,
-            fight.real, fight.whole, self._hits,
-        )  # fmt: skip
-        if deaths:
-            alive = fight.whole[:, :, ALIVE] != 0
-            for arena, disc in np.argwhere(self._inside & ~alive & running[:, None]).tolist():
-                world.take_out(arena, disc)
-            self._inside &= alive
+    def _take_out_the_dead(self, running: BoolArray, world: World) -> None:
+        alive = self._fight.whole[:, :, ALIVE] != 0
+        world.take_out(self._inside & ~alive & running[:, None])
+        self._inside &= alive
 
 
 def _actors(config: SkirmishConfig, robots: tuple[str, ...]) -> tuple[Actor, ...]:

@@ -1,7 +1,6 @@
 """The skirmish's numbers as arrays for compiled code: constants of the units, state of the fight.
 
-d discs: the n robots, then the m opponents. The names below are columns. Numba keeps compiled
-code by the file of the function: after a change here, remove ``__pycache__`` of this folder.
+d discs: the n robots, then the m opponents. The names below are columns.
 """
 
 from __future__ import annotations

@@ -1,0 +1,44 @@
+"""Compiled code: what is kept of it must be of today's sources."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+HELPER = """
+from sim_pkg.compiled import helper
+ADDED = 1
+
+@helper
+def more(numbers):
+    numbers[0] += {added}
+"""
+ENTRY = """
+import numpy as np
+from sim_pkg.compiled import entry
+from other import ADDED, more
+
+@entry
+def count(numbers):
+    more(numbers)
+    return numbers[0] + ADDED
+
+print(count(np.zeros(1)), sum(count.stats.cache_hits.values()))
+"""
+
+
+def test_code_is_kept_until_a_file_beside_it_changes(tmp_path: Path) -> None:
+    (tmp_path / "main.py").write_text(ENTRY)
+
+    def run(helper: str) -> list[str]:
+        (tmp_path / "other.py").write_text(helper)
+        done = subprocess.run(
+            [sys.executable, "main.py"], cwd=tmp_path, check=True, capture_output=True, text=True
+        )
+        return done.stdout.split()
+
+    assert run(HELPER.format(added=1)) == ["2.0", "0"]
+    assert run(HELPER.format(added=1)) == ["2.0", "1"]
+    changed = HELPER.format(added=2).replace("ADDED = 1", "ADDED = 5")
+    assert run(changed) == ["7.0", "0"]  # of one change alone it would be 6 or 3
