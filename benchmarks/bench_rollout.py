@@ -16,15 +16,16 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.numpy_learner.learner import NumpyLearner
 from crash_coach_pkg.coach.coach import Coach
 from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
 from policy_pkg.episode import Sizes
 from policy_pkg.learner.config import LearnerConfig
 from policy_pkg.learner.learner import Learner
-from policy_pkg.learner.replay import Replay
+from policy_pkg.learner.replay import Batch, Replay
 from policy_pkg.play.rollout import Rollout
 from policy_pkg.policy import RecurrentPolicy
-from policy_pkg.train.config import TrainConfig
+from policy_pkg.train.config import TrainConfig, load_train_config
 from policy_pkg.train.session import TrainSession
 from sim_pkg.env import make_env
 from sim_pkg.scenario_files import find_scenario
@@ -35,6 +36,8 @@ CRASH_RATE = 0.1
 REPEATS = 5
 ROLLOUT_TARGET = 20_000.0
 TRAINING_TARGET = 4_000.0
+COMBAT = "skirmish/3s_vs_5z"
+NUMPY_TARGET = 1.4
 
 Row = dict[str, Any]
 
@@ -85,6 +88,46 @@ def training_rate(scenario: str, calls: int) -> float:
     return steps_per_cpu_s(work, 8 * calls)
 
 
+class _Both:
+    """A session's learner, and beside it the one in numpy: the same batches, each timed."""
+
+    def __init__(self, learner: Learner, config: TrainConfig) -> None:
+        self._learner = learner
+        self._numpy = NumpyLearner(config.learner, learner.sizes, config.seed)
+        self.agent_weights = learner.agent_weights
+        self.ours_s = self.numpy_s = 0.0
+
+    @property
+    def updates(self) -> int:
+        return self._learner.updates
+
+    def update(self, batch: Batch, *, episodes: int) -> dict[str, float]:
+        started_s = time.process_time()
+        metrics = self._learner.update(batch, episodes=episodes)
+        middle_s = time.process_time()
+        self._numpy.update(batch)
+        self.ours_s += middle_s - started_s
+        self.numpy_s += time.process_time() - middle_s
+        return metrics
+
+
+def training_rates(scenario: str, updates: int) -> tuple[float, float]:
+    """A whole training by skirmish/qmix, a gradient step per episode, from where batches begin:
+    with our learner, and with the one in numpy in its place."""
+    config = load_train_config("skirmish/qmix", [f"scenario={scenario}"])
+    session = TrainSession(config, make_env(scenario, config.n_envs), make_env(scenario, 1))
+    both = _Both(session.learner, config)
+    session.learner = both  # type: ignore[assignment]
+    while both.updates < 3:
+        session.advance()
+    both.ours_s = both.numpy_s = 0.0
+    started_s, first, steps = time.process_time(), both.updates, session.steps
+    while both.updates < first + updates:
+        session.advance()
+    spent_s, steps = time.process_time() - started_s, session.steps - steps
+    return steps / (spent_s - both.numpy_s), steps / (spent_s - both.ours_s)
+
+
 def longer(scenario: str, episode_limit: int, folder: Path) -> str:
     """The path of the same scenario with another episode limit."""
     lines = find_scenario(scenario).read_text().splitlines()
@@ -113,7 +156,15 @@ def rows() -> list[Row]:
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
         eight = longer("buttons_8", 60, Path(folder))
+        ours, before = training_rates(COMBAT, 200)
         return [
+            {
+                **row(f"training {COMBAT}, and with the learner in numpy", ours, NUMPY_TARGET),
+                "reference": before,
+                "ratio": ours / before,
+                "target": f">= {NUMPY_TARGET}x",
+                "ok": ours / before >= NUMPY_TARGET,
+            },
             row(
                 "rollout buttons 32 environments",
                 rollout_rate("buttons", ARENAS, 400),
