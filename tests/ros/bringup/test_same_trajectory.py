@@ -99,7 +99,10 @@ def busy_cores() -> Iterator[None]:
 
 @pytest.mark.parametrize(
     "scenario",
-    ["transport", "skirmish/3s_vs_3z", pytest.param("skirmish/8m", marks=pytest.mark.soak)],
+    [
+        "skirmish/3s_vs_3z",
+        *(pytest.param(name, marks=pytest.mark.soak) for name in ("transport", "skirmish/8m")),
+    ],
 )
 def test_every_kind_of_scenario(tmp_path: Path, scenario: str) -> None:
     checkpoint = untrained(tmp_path, scenario)

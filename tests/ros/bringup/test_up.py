@@ -32,6 +32,7 @@ from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 from sim_pkg.ros.sim_lock import only_sim
 
+SOAK = pytest.mark.soak
 TOLD_WITHIN_S = 2.0
 UP = """
 import json, sys
@@ -104,7 +105,10 @@ def await_episode() -> None:
         client.until(lambda: any(s.step > 0 for s in states), 40, "a control step")
 
 
-@pytest.mark.parametrize("victim", ["coach", "gate", "sim", "policy_robot_1"])
+@pytest.mark.parametrize(
+    "victim",
+    ["coach", "policy_robot_1", *(pytest.param(name, marks=SOAK) for name in ("gate", "sim"))],
+)
 def test_a_node_that_is_killed_is_told_and_ends_the_graph(
     checkpoint: Path, tmp_path: Path, ros_env: dict[str, str], victim: str
 ) -> None:
@@ -143,7 +147,11 @@ def test_ctrl_c_ends_everything_without_a_trace(
 
 @pytest.mark.parametrize(
     ("layout", "mode", "processes"),
-    [("team", "lockstep", 4), ("nodes", "realtime", 5), ("single", "lockstep", 1)],
+    [
+        pytest.param("team", "lockstep", 4, marks=SOAK),
+        ("nodes", "realtime", 5),
+        ("single", "lockstep", 1),
+    ],
 )
 def test_the_last_episode_is_a_good_end(
     checkpoint: Path,
