@@ -24,18 +24,26 @@ refuse it.
 
 
 def entry(function: Callable[..., Any]) -> Any:
-    """Compiles, and keeps the code until any file beside the function's changes.
+    """Compiles, and keeps the code until any file of the function's package or of this one changes.
 
     Numba itself looks at the function's own file only, and would keep what it has compiled of a
     helper or of a constant in another one. It names what it keeps by the qualified name.
     """
-    function.__qualname__ += f"_{_digest(Path(inspect.getfile(function)).parent)}"
+    own = _package(Path(inspect.getfile(function)).parent)
+    function.__qualname__ += f"_{_digest(own)}{_digest(_package(Path(__file__).parent))}"
     return njit(cache=True)(function)
 
 
+def _package(folder: Path) -> Path:
+    """The outermost package that the folder lies in."""
+    while (folder / "__init__.py").is_file() and (folder.parent / "__init__.py").is_file():
+        folder = folder.parent
+    return folder
+
+
 @cache
-def _digest(folder: Path) -> str:
+def _digest(package: Path) -> str:
     sources = hashlib.sha256()
-    for path in sorted(folder.glob("*.py")):
+    for path in sorted(package.rglob("*.py")):
         sources.update(path.read_bytes())
-    return sources.hexdigest()[:12]
+    return sources.hexdigest()[:8]

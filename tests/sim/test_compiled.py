@@ -28,7 +28,7 @@ print(count(np.zeros(1)), sum(count.stats.cache_hits.values()))
 """
 
 
-def test_code_is_kept_until_a_file_beside_it_changes(tmp_path: Path) -> None:
+def test_code_is_kept_until_a_file_of_its_package_changes(tmp_path: Path) -> None:
     (tmp_path / "main.py").write_text(ENTRY)
 
     def run(helper: str) -> list[str]:

@@ -11,11 +11,11 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
-from numba import njit
 from pydantic import Field, model_validator
 
 from crash_coach_common.contract import BoolArray, EnvSpec, IntArray
 from crash_coach_common.strict_yaml import StrictModel
+from sim_pkg.compiled import entry
 from sim_pkg.scenarios.base import (
     Buffers,
     EpisodeLimit,
@@ -182,7 +182,7 @@ class Buttons:
         )
 
 
-@njit(cache=True)
+@entry
 def _command(running, actions, moves, cells, rows, cell_m, dt_s, max_speed_mps, bodies, commands):  # type: ignore[no-untyped-def]
     """Velocity that takes each robot from where it is to the centre of the cell it was told.
 
@@ -205,7 +205,7 @@ def _command(running, actions, moves, cells, rows, cell_m, dt_s, max_speed_mps, 
             commands[b, i, 1] = vy
 
 
-@njit(cache=True)
+@entry
 def _read_cells(running, bodies, rows, columns, cell_m, cells):  # type: ignore[no-untyped-def]
     """The cell in which each robot's centre lies, from the physics."""
     for b in range(cells.shape[0]):
@@ -218,7 +218,7 @@ def _read_cells(running, bodies, rows, columns, cell_m, cells):  # type: ignore[
             cells[b, i, 1] = min(max(column, 0), columns - 1)
 
 
-@njit(cache=True)
+@entry
 def _score(running, cells, buttons, touched, steps, limit, rewards, reward, terminated, success):  # type: ignore[no-untyped-def]
     for b in range(cells.shape[0]):
         if not running[b]:
@@ -238,7 +238,7 @@ def _score(running, cells, buttons, touched, steps, limit, rewards, reward, term
         terminated[b] = done or steps[b] >= limit
 
 
-@njit(cache=True)
+@entry
 def _observe(running, cells, buttons, scale, obs, state):  # type: ignore[no-untyped-def]
     n, m = cells.shape[1], buttons.shape[0]
     for b in range(cells.shape[0]):

@@ -24,11 +24,11 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numba import njit
 from pydantic import Field, model_validator
 
 from crash_coach_common.contract import BoolArray, IntArray
 from crash_coach_common.strict_yaml import Misplaced
+from sim_pkg.compiled import entry
 from sim_pkg.scenarios import drive
 from sim_pkg.scenarios.base import Buffers, Kind, Scene, episode_rng
 from sim_pkg.scenarios.drive import DrivenConfig, Metres, Point, clip
@@ -118,7 +118,7 @@ class Coverage:
         self.observe(running, world, out)
 
 
-@njit(cache=True)
+@entry
 def _watched(bodies, n, site, radius_m, speed_mps):  # type: ignore[no-untyped-def]
     """Whether one of the n robots is at ``site`` and slow enough."""
     for i in range(n):
@@ -130,7 +130,7 @@ def _watched(bodies, n, site, radius_m, speed_mps):  # type: ignore[no-untyped-d
     return False
 
 
-@njit(cache=True)
+@entry
 def _score(  # type: ignore[no-untyped-def]
     running, bodies, sites, left_s, steps, radius_m, speed_mps, dt_s, limit, reward_site,
     reward_step, reward, terminated, success,
@@ -153,7 +153,7 @@ def _score(  # type: ignore[no-untyped-def]
         terminated[b] = done or steps[b] >= limit
 
 
-@njit(cache=True)
+@entry
 def _observe(  # type: ignore[no-untyped-def]
     running, bodies, sites, left, arena_m, speed_mps, sight_m, time, obs, state
 ):

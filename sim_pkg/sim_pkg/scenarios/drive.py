@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from numba import njit
 from pydantic import Field
 
 from crash_coach_common.contract import EnvSpec
 from crash_coach_common.strict_yaml import Misplaced, StrictModel
+from sim_pkg.compiled import entry
 from sim_pkg.scenarios.base import (
     EpisodeLimit,
     MassKg,
@@ -134,7 +134,7 @@ def check_inside(
         )
 
 
-@njit(cache=True)
+@entry
 def steer(running, actions, directions, speed_mps, commands):  # type: ignore[no-untyped-def]
     """Actions (B, n) as commanded velocities: full speed in the action's direction, or none."""
     for b in range(actions.shape[0]):
@@ -144,13 +144,13 @@ def steer(running, actions, directions, speed_mps, commands):  # type: ignore[no
                     commands[b, i, k] = speed_mps * directions[actions[b, i], k]
 
 
-@njit(cache=True)
+@entry
 def clip(value):  # type: ignore[no-untyped-def]
     """To [-1, 1]: an overlap of a millimetre, or a knock, must not leave the declared bounds."""
     return min(max(value, -1.0), 1.0)
 
 
-@njit(cache=True)
+@entry
 def write_robots(bodies, arena_m, speed_mps, out):  # type: ignore[no-untyped-def]
     """x, y in [-1, 1] over the arena and vx, vy over the top speed, of each robot, into ``out``."""
     for i in range(out.shape[0] // 4):
@@ -159,7 +159,7 @@ def write_robots(bodies, arena_m, speed_mps, out):  # type: ignore[no-untyped-de
             out[4 * i + 2 + k] = clip(bodies[i, 2 + k] / speed_mps)
 
 
-@njit(cache=True)
+@entry
 def write_others(bodies, n, i, sight_m, out):  # type: ignore[no-untyped-def]
     """Per other robot, in index order: seen, dx, dy over ``sight_m``; zeros where unseen."""
     at = 0

@@ -31,11 +31,11 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numba import njit
 from pydantic import Field, model_validator
 
 from crash_coach_common.contract import BoolArray, IntArray
 from crash_coach_common.strict_yaml import Misplaced, StrictModel
+from sim_pkg.compiled import entry
 from sim_pkg.scenarios import drive
 from sim_pkg.scenarios.base import Buffers, Kind, MassKg, Scene, episode_rng
 from sim_pkg.scenarios.drive import DrivenConfig, Metres, Point, clip
@@ -176,7 +176,7 @@ class Transport:
         self.observe(running, world, out)
 
 
-@njit(cache=True)
+@entry
 def _hold(bodies, n, rough, smooth_n, rough_n, floor_n):  # type: ignore[no-untyped-def]
     """The floor's friction force on each box, by where its centre is."""
     for b in range(floor_n.shape[0]):
@@ -188,7 +188,7 @@ def _hold(bodies, n, rough, smooth_n, rough_n, floor_n):  # type: ignore[no-unty
                     floor_n[b, k] = rough_n
 
 
-@njit(cache=True)
+@entry
 def _score(  # type: ignore[no-untyped-def]
     running, bodies, goal, gap_m, steps, radius_m, limit, reward_metre, reward_goal, reward_step,
     reward, terminated, success,
@@ -208,7 +208,7 @@ def _score(  # type: ignore[no-untyped-def]
         terminated[b] = there or steps[b] >= limit
 
 
-@njit(cache=True)
+@entry
 def _observe(  # type: ignore[no-untyped-def]
     running, bodies, turns, goal, arena_m, speed_mps, sight_m, time, obs, state
 ):

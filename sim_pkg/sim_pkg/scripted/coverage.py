@@ -11,9 +11,9 @@ from functools import partial
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from crash_coach_common.contract import BoolArray, EnvSpec, EpisodeArray, FloatArray, IntArray
+from sim_pkg.compiled import entry
 from sim_pkg.scenarios import drive
 from sim_pkg.scenarios.coverage import CoverageConfig
 from sim_pkg.scripted.base import Entry
@@ -48,7 +48,7 @@ class CoveragePolicy:
         )  # fmt: skip
 
 
-@njit(cache=True)
+@entry
 def _read_sites(row, arena_m, sites, seen_done):  # type: ignore[no-untyped-def]
     """Places of the sites relative to the robot in m; notes which it sees done."""
     for j in range(len(sites)):
@@ -58,7 +58,7 @@ def _read_sites(row, arena_m, sites, seen_done):  # type: ignore[no-untyped-def]
             seen_done[j] = True
 
 
-@njit(cache=True)
+@entry
 def _taken(site, others, radius_m):  # type: ignore[no-untyped-def]
     """Whether another robot is seen at ``site``, nearer to it than this one."""
     own = site[0] * site[0] + site[1] * site[1]
@@ -69,7 +69,7 @@ def _taken(site, others, radius_m):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True)
+@entry
 def _choose(i, n, sites, others, seen_done, fills_holes, radius_m):  # type: ignore[no-untyped-def]
     """The site to go to, -1: none. Its own in order, then the nearest of the others'."""
     best, best_gap = -1, np.inf
@@ -84,7 +84,7 @@ def _choose(i, n, sites, others, seen_done, fills_holes, radius_m):  # type: ign
     return best
 
 
-@njit(cache=True)
+@entry
 def _act(  # type: ignore[no-untyped-def]
     obs, seen_done, fills_holes, arena_m, sight_m, radius_m, apart_m, directions, speed_mps,
     accel_mps2, dt_s, actions,

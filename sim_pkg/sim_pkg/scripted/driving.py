@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from sim_pkg.compiled import entry
 
 # Metres that a robot goes out of its way for each metre by which it would come too near.
 AVOID = 4.0
 
 
-@njit(cache=True)
+@entry
 def drive_to(target, velocity, others, apart_m, directions, speed_mps, accel_mps2, dt_s):  # type: ignore[no-untyped-def]
     """The action after which braking would end nearest to ``target`` and clear of ``others``.
 
@@ -36,7 +37,7 @@ def drive_to(target, velocity, others, apart_m, directions, speed_mps, accel_mps
     return best
 
 
-@njit(cache=True)
+@entry
 def read_others(row, sight_m, others):  # type: ignore[no-untyped-def]
     """(k, 2) places of the other robots from (seen, dx, dy) triples; NaN where unseen."""
     for k in range(len(others)):

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from crash_coach_common.contract import BoolArray, EnvSpec, EpisodeArray, FloatArray, IntArray
+from sim_pkg.compiled import entry
 from sim_pkg.scenarios.skirmish.config import SkirmishConfig
 from sim_pkg.scenarios.skirmish.layout import (
     DISTANCE,
@@ -146,7 +146,7 @@ class Evade:
         )  # fmt: skip
 
 
-@njit(cache=True)
+@entry
 def _charge(  # type: ignore[no-untyped-def]
     obs, available, first, width, shielded, full, reach, weakest, actions
 ):
@@ -162,7 +162,7 @@ def _charge(  # type: ignore[no-untyped-def]
             actions[b, i] = FIRST_ATTACK + target if target >= 0 else advance(view, free)
 
 
-@njit(cache=True)
+@entry
 def _evade(  # type: ignore[no-untyped-def]
     obs, available, places, shielded, full, speed, reach, rest, danger, back, chased_only, since,
     fled, actions,
@@ -195,7 +195,7 @@ def _evade(  # type: ignore[no-untyped-def]
                 actions[b, i] = advance(view, free)
 
 
-@njit(cache=True)
+@entry
 def _chased(seen, row, n, places):  # type: ignore[no-untyped-def]
     """Whether no ally in sight is clearly nearer to the opponent."""
     for k in range(n - 1):

@@ -6,8 +6,8 @@ Shapes: m opponents. A robot's view of them is (m, VIEW_COLUMNS), in metres, rel
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from sim_pkg.compiled import entry
 from sim_pkg.scenarios.skirmish.layout import (
     ATTACKABLE,
     DISTANCE,
@@ -29,7 +29,7 @@ KEEP_M = 0.6  # of distance that going on in the same direction is worth: turns 
 TURN_M = 1.0  # ... and that going around the opponents on one side is: out of corners
 
 
-@njit(cache=True)
+@entry
 def look(row, first, width, shielded, full, available, view):  # type: ignore[no-untyped-def]
     """Fills ``view`` from an observation row. full: (m, 2) largest health and shield."""
     for j in range(view.shape[0]):
@@ -44,7 +44,7 @@ def look(row, first, width, shielded, full, available, view):  # type: ignore[no
             view[j, LEFT] += part[HEALTH + 1] * full[j, 1]
 
 
-@njit(cache=True)
+@entry
 def least(view, which, of):  # type: ignore[no-untyped-def]
     """The opponent with the smallest column ``of`` among those with column ``which``; -1: none."""
     best, found = np.inf, -1
@@ -54,7 +54,7 @@ def least(view, which, of):  # type: ignore[no-untyped-def]
     return found
 
 
-@njit(cache=True)
+@entry
 def pick(view, reach):  # type: ignore[no-untyped-def]
     """The weakest opponent within ``reach`` (m,), else the nearest that may be attacked; -1: none.
 
@@ -67,7 +67,7 @@ def pick(view, reach):  # type: ignore[no-untyped-def]
     return found if found >= 0 else least(view, CAN, AWAY)
 
 
-@njit(cache=True)
+@entry
 def towards(x, y, available):  # type: ignore[no-untyped-def]
     """The available move that leads most towards (x, y); stop if all lead away."""
     best, action = 0.0, STOP
@@ -78,7 +78,7 @@ def towards(x, y, available):  # type: ignore[no-untyped-def]
     return action
 
 
-@njit(cache=True)
+@entry
 def advance(view, available):  # type: ignore[no-untyped-def]
     """Towards the nearest opponent in sight; without one, east, where they come from."""
     near = least(view, SEEN, AWAY)
@@ -87,7 +87,7 @@ def advance(view, available):  # type: ignore[no-untyped-def]
     return towards(view[near, X], view[near, Y], available)
 
 
-@njit(cache=True)
+@entry
 def flee(view, threats, own_mps, their_mps, available, last):  # type: ignore[no-untyped-def]
     """The move that keeps the nearest of ``threats`` (m,) farthest away, if all follow.
 

@@ -12,9 +12,9 @@ from functools import partial
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from crash_coach_common.contract import BoolArray, EnvSpec, EpisodeArray, FloatArray, IntArray
+from sim_pkg.compiled import entry
 from sim_pkg.scenarios import drive
 from sim_pkg.scenarios.transport import TransportConfig
 from sim_pkg.scripted.base import Entry
@@ -91,7 +91,7 @@ def _way_around(config: TransportConfig) -> tuple[float, float]:
     return float(x2.max() + 2 * _BERTH_M), float(y)
 
 
-@njit(cache=True)
+@entry
 def _axis(way, angle, before, first):  # type: ignore[no-untyped-def]
     """Which face's direction to push in, 0..3: quarter turns from the box's own x axis.
 
@@ -113,7 +113,7 @@ def _axis(way, angle, before, first):  # type: ignore[no-untyped-def]
     return pick if along[pick] > 0.0 else pick + 2
 
 
-@njit(cache=True)
+@entry
 def _crosses(start, end, rough, berth_m):  # type: ignore[no-untyped-def]
     """Whether the straight way from start to end leads over rough floor or close by."""
     for step in range(41):
@@ -126,7 +126,7 @@ def _crosses(start, end, rough, berth_m):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True)
+@entry
 def _count_still(place, box, last_m, still, reach_m):  # type: ignore[no-untyped-def]
     """For how many steps a robot that is seen at ``place`` has not moved.
 
@@ -145,7 +145,7 @@ def _count_still(place, box, last_m, still, reach_m):  # type: ignore[no-untyped
     return still + 1 if still + 1 < patience else _LEFT_OUT
 
 
-@njit(cache=True)
+@entry
 def _line_up(here, others, active, direction, half_m, radius_m):  # type: ignore[no-untyped-def]
     """(along, beside, offset, all are behind) of a robot.
 
@@ -175,7 +175,7 @@ def _line_up(here, others, active, direction, half_m, radius_m):  # type: ignore
     return along, beside, (rank - 0.5 * (size - 1)) * spacing, ready
 
 
-@njit(cache=True)
+@entry
 def _approach(here, place, reach_m):  # type: ignore[no-untyped-def]
     """Where to go next on the way from ``here`` to ``place`` around the box, relative to it."""
     dx, dy = place[0] - here[0], place[1] - here[1]
@@ -194,7 +194,7 @@ def _approach(here, place, reach_m):  # type: ignore[no-untyped-def]
     return radius * np.cos(angle), radius * np.sin(angle)
 
 
-@njit(cache=True)
+@entry
 def _towards(x, y, directions):  # type: ignore[no-untyped-def]
     """The action whose direction is nearest to (x, y)."""
     best, best_dot = 0, -np.inf
@@ -205,7 +205,7 @@ def _towards(x, y, directions):  # type: ignore[no-untyped-def]
     return best
 
 
-@njit(cache=True)
+@entry
 def _push(  # type: ignore[no-untyped-def]
     here, velocity, others, active, direction, half_m, reach_m, radius_m, directions, motion
 ):
@@ -229,7 +229,7 @@ def _push(  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@njit(cache=True)
+@entry
 def _act(  # type: ignore[no-untyped-def]
     obs, last_m, still, around, past, axis, goes_around, arena_m, sight_m, rough, via, half_m,
     reach_m, radius_m, directions, motion, actions,
