@@ -96,7 +96,11 @@ class BagWriter:
         self._episodes = 0  # ended in this file
         self._full = False  # the next message begins a new file
         _make(folder)
-        self._open()
+        try:
+            self._open()
+        except OSError as error:
+            self._abandon()
+            raise UserError(f"{folder}: {error.strerror}") from error
 
     @property
     def messages(self) -> int:
@@ -174,6 +178,11 @@ class BagWriter:
         self._full = False
         self._flush()
         self._write_metadata()
+
+    def _abandon(self) -> None:
+        """A recording that could not be begun leaves nothing in its folder."""
+        for path in self._folder.iterdir():
+            path.unlink()
 
     def _finish(self) -> None:
         self._writer.finish()  # type: ignore[no-untyped-call]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -114,6 +115,18 @@ def test_a_folder_in_use_is_refused(tmp_path: Path, team: Team) -> None:
         BagWriter(tmp_path / "bag", team.connections, STORE, team.about, time.monotonic)
     with pytest.raises(UserError, match="compression 'rar'"):
         write(tmp_path / "b", team, [], compression="rar")
+
+
+def test_a_recording_that_cannot_be_begun_leaves_nothing(
+    tmp_path: Path, team: Team, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(UserError, match="bag: No space left on device"):
+        BagWriter(tmp_path / "bag", team.connections, STORE, team.about, time.monotonic)
+    assert list((tmp_path / "bag").iterdir()) == []
 
 
 def test_the_recordings_words_are_protected(team: Team) -> None:

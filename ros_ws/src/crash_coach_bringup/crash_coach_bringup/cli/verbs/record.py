@@ -13,6 +13,7 @@ import typer
 from crash_coach_bringup.cli.output import CliError
 from sim_pkg.env import make_env
 
+EXECUTABLE = "crash_coach_common.executable"
 MODULE = "policy_pkg.ros.recorder_node"
 
 
@@ -86,5 +87,6 @@ def record(
     }
     from crash_coach_bringup.ros.graph import ros_arguments
 
-    # In place of this process: signals reach the recorder itself.
-    os.execv(sys.executable, [sys.executable, "-m", MODULE, *ros_arguments([], "", parameters)])
+    # In place of this process: signals reach the recorder itself, from its first moment.
+    command = [sys.executable, "-m", EXECUTABLE, MODULE, *ros_arguments([], "", parameters)]
+    os.execv(sys.executable, command)
