@@ -164,7 +164,7 @@ def test_the_recipes_sweeps_give_every_method_the_same_learner(
 
 
 def test_table1_is_the_papers() -> None:
-    shipped = ("ablation", "combat", "robust", "share")
+    shipped = ("ablation", "combat", "coverage", "one_step", "robust", "share")
     papers = ("paper/gridworld", "paper/table1", "paper/table2")
     assert sweep_names() == (*papers, *(f"recipe/{name}" for name in shipped))
     assert not set(sweep_names()) & set(train_config_names())

@@ -30,8 +30,8 @@ VICTIMS = (
     "average over the methods, comes first."
 )
 COPING = (
-    f"A block copes where the team succeeds in at least {COPES:.0%} of its episodes crash-free and "
-    "with each robot crashed. In brackets Wilson's interval (95 %) over seeds."
+    f"A block copes where the team succeeds in at least {100 * COPES:.0f} % of its episodes "
+    "crash-free and with each robot crashed. In brackets Wilson's interval (95 %) over seeds."
 )
 
 
@@ -54,7 +54,7 @@ def page(findings: Findings) -> str:
     if findings.costs:
         parts += ["## Who hurts most", VICTIMS, *_victims(findings.costs)]
     if findings.coping:
-        parts += ["## When they cope", COPING, _coping(findings.coping)]
+        parts += ["## When they cope", COPING, coping_table(findings.coping)]
     if about["against"]:
         parts += ["## Differences", *_differences(findings.paired)]
     if findings.improvements:
@@ -159,7 +159,8 @@ def _victims(costs: Sequence[Cost]) -> list[str]:
     return out
 
 
-def _coping(found: Sequence[Coping]) -> str:
+def coping_table(found: Sequence[Coping]) -> str:
+    """A line per map and method."""
     lines = []
     for each in found:
         seeds, ended = len(each.seeds), sum(each.at_end)
@@ -169,7 +170,7 @@ def _coping(found: Sequence[Coping]) -> str:
             first = f"{steps[0]:,} to {steps[-1]:,}, median {round(median(steps)):,}"
         if never := seeds - len(steps):
             first = "never" if never == seeds else f"{first}; {never} never"
-        around = f"{ended} of {seeds} ({span(wilson(ended, seeds))})"
+        around = f"{ended} of {seeds} ({span(wilson(ended, seeds))} %)"
         last = f"{sum(each.last)} of {each.last_blocks}"
         lines.append([each.scenario, each.method, around, last, first])
     columns = ["at the end", f"in the last {LAST_BLOCKS} blocks", "first, steps"]
