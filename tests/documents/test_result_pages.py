@@ -32,5 +32,5 @@ def test_when_they_cope(sweep: str) -> None:
 def test_who_copes_on_coverage() -> None:
     page = " ".join((PAGES / "coverage.md").read_text().split())
     ended = {each.method: f"{sum(each.at_end)} of {len(each.seeds)}" for each in found("coverage")}
-    words = f"at the end are {ended['robust']} (15..85 %) against {ended['qmix-robust']} (0..49 %)"
+    words = f"at the end are {ended['robust']} (12..77 %) against {ended['qmix-robust']} (0..43 %)"
     assert words in page
