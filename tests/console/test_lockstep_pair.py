@@ -37,6 +37,23 @@ class Pair:
     def newest(self) -> int:
         return max((*self.ends[0], *self.ends[1]), default=-1)
 
+    def until_crashed(self, first: list[int], second: list[int]) -> list[EpisodeState]:
+        """How the next episode of both ended, once each team's newest has these crashed.
+
+        What the teams were asked may take, and states that wait to be read may be old.
+        """
+        for client, ends, crashed in zip(self.clients, self.ends, (first, second), strict=True):
+            client.until(
+                lambda ends=ends, crashed=crashed: (  # type: ignore[misc]
+                    bool(ends) and list(ends[max(ends)].crashed) == crashed
+                ),
+                WAIT_S,
+                f"an episode with {crashed} crashed",
+            )
+        both = self.until_both(self.newest() + 1)
+        assert [list(end.crashed) for end in both] == [first, second]
+        return both
+
     def until_both(self, episode: int) -> list[EpisodeState]:
         """How ``episode`` ended for each."""
         for client, ends in zip(self.clients, self.ends, strict=True):
@@ -78,17 +95,15 @@ def test_the_same_seed_gives_both_the_same_episodes_also_under_the_same_fault(pa
             source=source, type="inject", victims=["robot_1"], mode="mute", apply_at="next_episode"
         )
         assert answer["ok"], answer
-    faulted = pair.until_both(pair.newest() + 3)
-    assert [list(end.crashed) for end in faulted] == [[1, 0], [1, 0]]
+    faulted = pair.until_crashed([1, 0], [1, 0])
     assert faulted[0].trajectory_hash == faulted[1].trajectory_hash
     for source in (0, 1):
         answer = pair.ask(source=source, type="clear", robots=[])
         assert answer["ok"], answer
-    assert [list(e.crashed) for e in pair.until_both(pair.newest() + 3)] == [[0, 0], [0, 0]]
+    pair.until_crashed([0, 0], [0, 0])
 
 
 def test_one_of_them_is_crashed_alone(pair: Pair) -> None:
     answer = pair.ask(source=1, type="inject", victims=["robot_2"], mode="mute")
     assert answer["ok"], answer
-    ends = pair.until_both(pair.newest() + 2)
-    assert [list(end.crashed) for end in ends] == [[0, 0], [0, 1]]
+    pair.until_crashed([0, 0], [0, 1])
