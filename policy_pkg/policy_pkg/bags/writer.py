@@ -22,6 +22,7 @@ COMPRESSIONS = {
     "none": CompressionType.NONE,
 }
 METADATA_FILE = "metadata.yaml"
+_PARTIAL = f"{METADATA_FILE}.partial"
 _METADATA_VERSION = 9
 _LIBRARY = "crash_coach recorder"
 
@@ -98,6 +99,8 @@ class BagWriter:
         _make(folder)
         try:
             self._open()
+        except FileExistsError:  # of another recording, which began here at the same moment
+            raise _used(folder) from None
         except OSError as error:
             self._abandon()
             raise UserError(f"{folder}: {error.strerror}") from error
@@ -149,7 +152,7 @@ class BagWriter:
         self._flushed_s = self._clock()
 
     def _open(self) -> None:
-        name = f"{self._folder.name}_{len(self._files)}.mcap"
+        name = self._name(len(self._files))
         self._stream: BinaryIO = (self._folder / name).open("xb")
         # Data CRC: what is not in chunks (the records about the recording) is protected too.
         self._writer = Writer(
@@ -180,9 +183,14 @@ class BagWriter:
         self._write_metadata()
 
     def _abandon(self) -> None:
-        """A recording that could not be begun leaves nothing in its folder."""
+        """A recording that could not be begun leaves nothing of its own in its folder."""
+        own = {self._name(0), _PARTIAL, METADATA_FILE}
         for path in self._folder.iterdir():
-            path.unlink()
+            if path.name in own:
+                path.unlink()
+
+    def _name(self, number: int) -> str:
+        return f"{self._folder.name}_{number}.mcap"
 
     def _finish(self) -> None:
         self._writer.finish()  # type: ignore[no-untyped-call]
@@ -190,7 +198,7 @@ class BagWriter:
 
     def _write_metadata(self) -> None:
         """metadata.yaml as rosbag2 wants it. JSON is YAML, and needs no further library."""
-        partial = self._folder / f"{METADATA_FILE}.partial"
+        partial = self._folder / _PARTIAL
         partial.write_text(json.dumps({"rosbag2_bagfile_information": self._metadata()}, indent=1))
         os.replace(partial, self._folder / METADATA_FILE)
 
@@ -246,7 +254,11 @@ def _make(folder: Path) -> None:
     except OSError as error:
         raise UserError(f"{folder}: {error.strerror}") from error
     if used:
-        raise UserError(f"{folder} is not empty: a recording needs a folder of its own")
+        raise _used(folder)
+
+
+def _used(folder: Path) -> UserError:
+    return UserError(f"{folder} is not empty: a recording needs a folder of its own")
 
 
 def _qos(connection: Connection) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import pytest
 from bag_maker import STORE, Made, Team, messages, write
 
 from crash_coach_common.contract import UserError
+from policy_pkg.bags import writer as writer_module
 from policy_pkg.bags.about import About, about_from_record
 from policy_pkg.bags.bag import Bag, Scan, bag_entries
 from policy_pkg.bags.problems import Problem
@@ -127,6 +128,17 @@ def test_a_recording_that_cannot_be_begun_leaves_nothing(
     with pytest.raises(UserError, match="bag: No space left on device"):
         BagWriter(tmp_path / "bag", team.connections, STORE, team.about, time.monotonic)
     assert list((tmp_path / "bag").iterdir()) == []
+
+
+def test_a_recording_that_began_here_at_the_same_moment_is_left_alone(
+    tmp_path: Path, team: Team, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write(tmp_path / "bag", team, [])
+    there = {path.name: path.read_bytes() for path in folder.iterdir()}
+    monkeypatch.setattr(writer_module, "_make", lambda folder: None)  # it looked before
+    with pytest.raises(UserError, match="is not empty"):
+        BagWriter(folder, team.connections, STORE, team.about, time.monotonic)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == there
 
 
 def test_the_recordings_words_are_protected(team: Team) -> None:
