@@ -94,13 +94,15 @@ def test_when_a_team_copes_block_by_block(tmp_path: Path) -> None:
     copes, one_fails, untested = (1.0, 0.8), (1.0, 0.79), (None, None)
     late = [probe(10, *one_fails), *(probe(10 * k, *copes) for k in range(2, 13))]
     lost = [probe(10, *copes), probe(20, *copes, free=0.5), probe(30, *untested), block(40, 1.0)]
+    recordings = [block(10, 1.0, success_1_crashed=1.0)]  # so many robots, not a robot
     runs = {"late": late, "lost": lost, "never": [probe(10, *one_fails)], "none": [block(10, 1.0)]}
+    runs["offline"] = recordings
     results = []
     for seed, (name, lines) in enumerate(runs.items()):
         run = replace(run_of(tmp_path / name, lines, test_episodes=8), seed=seed)
         results.append(Result(run, [], training_of(run)))
     (found,) = coping(results[::-1])
-    assert found.seeds == (0, 1, 2)  # nothing is known of the one without victims
+    assert found.seeds == (0, 1, 2)  # nothing is known of those without victims
     assert found.at_end == (True, False, False)
     assert (found.last, found.last_blocks) == ((10, 1, 0), 10 + 2 + 1)
     assert found.first_steps == (20, 10, None)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from policy_pkg.report.finished_runs import Run, read_lines
+from policy_pkg.train.metrics import crashed_robot
 from policy_pkg.train.run_dir import METRICS
 
 LAST_BLOCKS = 10
@@ -61,16 +62,16 @@ def training_of(run: Run) -> Training:
 
 def _victims(line: Mapping[str, Any]) -> list[str]:
     """The keys of a block's success with one robot crashed."""
-    return [key for key in line if key.startswith("success_") and key.endswith("_crashed")]
+    return [key for key in line if crashed_robot(key)]
 
 
 def _copes(line: Mapping[str, Any]) -> bool | None:
     """None for a block that did not test each robot crashed, or not crash-free."""
     victims = _victims(line)
-    rates = [line.get(key) for key in (CRASH_FREE, *victims)]
-    if not victims or any(rate is None for rate in rates):
+    rates: list[Any] = [line.get(key) for key in (CRASH_FREE, *victims)]
+    if not victims or None in rates:
         return None
-    return min(float(rate) for rate in rates if rate is not None) >= COPES
+    return all(rate >= COPES for rate in rates)
 
 
 def _steps(line: Mapping[str, Any]) -> int:

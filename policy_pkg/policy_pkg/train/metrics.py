@@ -34,7 +34,7 @@ updates_per_episode  gradient steps per finished episode, as configured
 ===================  ==========================================================================
 
 With test_victim_episodes there is a key ``success_R_crashed`` for each robot R: the success rate
-with it alone crashed.
+with it alone crashed. Runs on recordings have ``success_K_crashed`` for so many robots, drawn.
 
 ``timing.jsonl`` has one line per block as well: env_steps, wall_s (seconds since this process
 began training) and steps_per_s (environment steps per second since the last block, evaluation
@@ -45,6 +45,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,6 +54,13 @@ from crash_coach_common.contract import UserError
 from policy_pkg.train.run_dir import METRICS, TIMING
 
 Value = str | int | float | None
+UNDER_CRASH = re.compile(r"success_(.+)_crashed")
+
+
+def crashed_robot(key: str) -> str | None:
+    """Whose crash alone the success rate under ``key`` is of; None: of another condition."""
+    found = UNDER_CRASH.fullmatch(key)
+    return found[1] if found and not found[1].isdecimal() else None
 
 
 class JsonLines:

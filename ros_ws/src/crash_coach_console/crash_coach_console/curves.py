@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,12 +12,12 @@ from typing import Any
 from crash_coach_common.natural import natural
 from policy_pkg.checkpoint import split_best
 from policy_pkg.report.finished_runs import read_text
+from policy_pkg.train.metrics import UNDER_CRASH
 from policy_pkg.train.run_dir import METRICS
 
 LOOK_S = 1.0
 MOST_POINTS = 400
 _STEPS = ("env_steps", "gradient_steps")  # of a training; of learning from recordings
-_OF_VICTIM = re.compile(r"success_(.+)_crashed")
 _RATES = ("success_rate", "success_crash_free", "success_worst", "alpha")
 
 
@@ -67,7 +66,7 @@ def curves_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
     rows = [row for row in rows if isinstance(row.get(key), int | float)]
     every = max(1, math.ceil(len(rows) / MOST_POINTS))
     kept = rows[::-1][::every][::-1]
-    by_victim = {n for row in kept for n in row if _OF_VICTIM.fullmatch(n)}
+    by_victim = {n for row in kept for n in row if UNDER_CRASH.fullmatch(n)}
     names = (*_RATES, *sorted(by_victim, key=natural))
     series = {name: [_number(row.get(name)) for row in kept] for name in names}
     return {

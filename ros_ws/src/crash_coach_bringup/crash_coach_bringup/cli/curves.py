@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,13 +14,13 @@ import numpy.typing as npt
 
 from crash_coach_bringup.cli.output import CliError
 from policy_pkg.report.finished_runs import read_text
+from policy_pkg.train.metrics import crashed_robot
 from policy_pkg.train.run_dir import METRICS, RUN, read_run, seedless_name
 
 MAX_RANGE_SEEDS = 4
 CONFIDENCE = 0.95
 RESAMPLES = 2000
 EACH_CRASHED = "success_each_crashed"  # mean over the robots, each crashed alone in its episodes
-OF_ROBOT = re.compile(r"success_.+_crashed")  # as the metrics have it, see test_victim_episodes
 RANGE, BOOTSTRAP = "min..max", "95 % bootstrap interval of the mean"
 
 Floats = npt.NDArray[np.float64]
@@ -193,7 +192,7 @@ def _each_crashed(content: Mapping[str, Any]) -> float | None:
     found = [
         float(value)
         for key, value in content.items()
-        if OF_ROBOT.fullmatch(key) and key != "success_1_crashed" and isinstance(value, int | float)
+        if crashed_robot(key) and isinstance(value, int | float)
     ]
     return sum(found) / len(found) if found else None
 
