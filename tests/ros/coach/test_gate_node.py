@@ -71,12 +71,12 @@ def test_a_killed_coach_leaves_no_fault_behind(ros_env: dict[str, str]) -> None:
         for step in range(20):
             assert g.team.step(0, step)[0].faulted
         os.killpg(g.coach.pid, signal.SIGKILL)
-        killed = time.monotonic()
-        step = 20
+        killed_s, step = time.monotonic(), 20
+        begun_s = killed_s
         while g.team.step(0, step)[0].faulted:
-            step += 1
-        freed_s = time.monotonic() - killed
-        assert freed_s < lease_s + 10  # the machine may be busy
+            # When it was begun, not when its answer came: the machine may be busy.
+            assert begun_s - killed_s < lease_s + 0.5
+            begun_s, step = time.monotonic(), step + 1
         assert FaultEvent.EXPIRED in g.team.kinds()
         # The next episodes need no plan: nobody holds them.
         for episode in (1, 2):
