@@ -29,11 +29,12 @@ def entry(function: Callable[..., Any]) -> Any:
     Numba itself looks at the function's own file only, and would keep what it has compiled of a
     helper or of a constant in another one. It names what it keeps by the qualified name.
     """
-    own = _package(Path(inspect.getfile(function)).parent)
-    function.__qualname__ += f"_{_digest(own)}{_digest(_package(Path(__file__).parent))}"
+    for file in (inspect.getfile(function), __file__):
+        function.__qualname__ += f"_{_digest(_package(Path(file).parent))}"
     return njit(cache=True)(function)
 
 
+@cache
 def _package(folder: Path) -> Path:
     """The outermost package that the folder lies in."""
     while (folder / "__init__.py").is_file() and (folder.parent / "__init__.py").is_file():

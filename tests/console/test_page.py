@@ -121,24 +121,24 @@ def test_a_mode_with_its_parameters_from_the_next_episode(page: Page) -> None:
     assert not page.evaluate("document.getElementById('faults').checkValidity()")
 
 
-def test_why_a_plan_is_refused_is_shown(page: Page) -> None:
+def refused(page: Page, mode: str) -> str:
+    """What is answered where robot_1 is to crash so and cannot."""
     page.locator(".chip", has_text="robot_1").click()
-    # What the coach cannot know of its gate: that its commands have no velocities.
-    page.select_option("#mode", "bias")
-    page.get_by_role("button", name="Crash: bias").click()
+    page.select_option("#mode", mode)
+    page.get_by_role("button", name=f"Crash: {mode}").click()
     answer = page.locator("#answer[data-state=bad]")
     answer.wait_for()
-    assert re.search(r"refused: the gate refused: .*velocities", answer.inner_text())
+    return answer.inner_text()
+
+
+def test_why_a_plan_is_refused_is_shown(page: Page) -> None:
+    # What the coach cannot know of its gate: that its commands have no velocities.
+    assert re.search(r"refused: the gate refused: .*velocities", refused(page, "bias"))
     page.locator(".events li[data-kind=refused]", has_text="velocities").first.wait_for()
 
 
 def test_why_the_coach_refuses_what_its_gate_could_not_do_is_shown(page: Page) -> None:
-    page.locator(".chip", has_text="robot_1").click()
-    page.select_option("#mode", "blind")
-    page.get_by_role("button", name="Crash: blind").click()
-    answer = page.locator("#answer[data-state=bad]")
-    answer.wait_for()
-    assert re.search(r"refused: the gate would refuse: .*observations", answer.inner_text())
+    assert re.search(r"refused: the gate would refuse: .*observations", refused(page, "blind"))
 
 
 def test_two_teams_side_by_side_are_crashed_alike_or_one_alone(two: Page, teams: Teams) -> None:

@@ -7,14 +7,14 @@ import re
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 
 import pytest
 from coach_graph import operator, process
 from coach_operator import WAIT_S
 from crash_coach_interfaces.msg import FaultEvent
+from kept_running import kept_running
 from rclpy.parameter_client import AsyncParameterClient
 
 from crash_coach_bringup.ros.client import graph_client
@@ -41,18 +41,8 @@ def blocks() -> list[list[str]]:
     return [block.strip().splitlines() for block in found]
 
 
-@contextmanager
-def running(env: dict[str, str], command: str) -> Iterator[None]:
-    child = subprocess.Popen(
-        ["bash", "-c", f"exec {command}"], env=env, cwd=ROOT, start_new_session=True
-    )
-    try:
-        yield
-        assert child.poll() is None, f"it ended: {command}"
-    finally:
-        if child.poll() is None:
-            os.killpg(child.pid, signal.SIGKILL)
-        child.wait(timeout=WAIT_S)
+def running(env: dict[str, str], command: str) -> AbstractContextManager[None]:
+    return kept_running(["bash", "-c", f"exec {command}"], env, ROOT)
 
 
 @pytest.mark.parametrize("start", ["run", "launch"])

@@ -61,3 +61,11 @@ def crash_coach(folder: Path, line: str, *more: str) -> subprocess.CompletedProc
     paths = [str(folder), os.environ.get("PYTHONPATH", "")]
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     return subprocess.run(command, capture_output=True, text=True, timeout=250, env=env)
+
+
+def refused(folder: Path, line: str) -> str:
+    """What a page's command says where it ends with one clear error."""
+    done = crash_coach(folder, line)
+    assert done.returncode != 0
+    assert "Traceback" not in done.stderr
+    return " ".join(done.stderr.split())

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import math
 import os
-import signal
 import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 from coach_graph import operator, process, run_to_end
-from coach_operator import WAIT_S, Operator
+from coach_operator import Operator
 from crash_coach_interfaces.msg import FaultEvent
 from diagnostic_msgs.msg import DiagnosticStatus
 from fleet_drivers import BEST_EFFORT, PERIOD_S, ROVERS, SPEED_M_S, Drivers
 from geometry_msgs.msg import Twist, TwistStamped
+from kept_running import kept_running
 from rclpy.serialization import deserialize_message, serialize_message
 
 from crash_coach_bringup.ros import discovery
@@ -71,17 +71,9 @@ class Fleet:
         d.until(lambda: all(d.speed_m_s(name) == SPEED_M_S for name in ROVERS), "rovers that drive")
 
 
-@contextmanager
-def rover(env: dict[str, str], name: str) -> Iterator[None]:
+def rover(env: dict[str, str], name: str) -> AbstractContextManager[None]:
     script = str(Path(__file__).parents[2] / "support" / "fleet.py")
-    child = subprocess.Popen([sys.executable, script, name], env=env, start_new_session=True)
-    try:
-        yield
-        assert child.poll() is None, f"{name} died"
-    finally:
-        if child.poll() is None:
-            os.killpg(child.pid, signal.SIGKILL)
-        child.wait(timeout=WAIT_S)
+    return kept_running([sys.executable, script, name], env)
 
 
 @pytest.fixture(scope="module")

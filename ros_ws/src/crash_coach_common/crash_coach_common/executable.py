@@ -1,7 +1,4 @@
-"""Starts executables: ready for signals before anything else is loaded.
-
-Also ``python -m crash_coach_common.executable MODULE ...``, for one without a script of its own.
-"""
+"""Starts executables: ready for signals before anything else is loaded."""
 
 from __future__ import annotations
 
@@ -11,6 +8,11 @@ import signal
 import sys
 from types import FrameType
 from typing import NoReturn
+
+
+def command(module: str) -> tuple[str, ...]:
+    """What starts ``module`` so, for one without a script of its own."""
+    return (sys.executable, "-m", "crash_coach_common.executable", module)
 
 
 def run(module: str) -> int:

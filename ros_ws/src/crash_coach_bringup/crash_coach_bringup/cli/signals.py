@@ -22,6 +22,12 @@ class Terminated(SystemExit):
         super().__init__(exit_code(signal.SIGTERM))
 
 
+_RAISED: dict[int, type[BaseException]] = {
+    signal.SIGINT: KeyboardInterrupt,
+    signal.SIGTERM: Terminated,
+}
+
+
 def exit_code(number: int) -> int:
     """As a shell tells it."""
     return 128 + number
@@ -59,17 +65,17 @@ def raised() -> Iterator[None]:
 
     def handle(number: int, frame: FrameType | None) -> NoReturn:
         heard.set()
-        raise KeyboardInterrupt if number == signal.SIGINT else Terminated
+        raise _RAISED[number]
 
     def dropped(what: sys.UnraisableHookArgs) -> None:
-        number = {KeyboardInterrupt: signal.SIGINT, Terminated: signal.SIGTERM}.get(what.exc_type)
+        number = next((n for n, kind in _RAISED.items() if kind is what.exc_type), None)
         if number is None:
             hook(what)
             return
         heard.clear()
         threading.Thread(target=_until, args=(heard, number), daemon=True).start()
 
-    for number in WORDS:
+    for number in _RAISED:
         _set(number, handle)
     sys.unraisablehook = dropped
     try:

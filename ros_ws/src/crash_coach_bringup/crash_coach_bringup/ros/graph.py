@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from crash_coach_bringup.ros.namespaces import checked_namespace
 from crash_coach_bringup.ros.parameter_file import ParameterFile
 from crash_coach_bringup.ros.probe import find_executable
 from crash_coach_common.contract import UserError
+from crash_coach_common.executable import command
 from crash_coach_pkg.coach.config import CoachConfig, FaultConfig, TeamSpec
 from crash_coach_pkg.coach.fault_scenario import load_fault_scenario
 from crash_coach_pkg.faults import check_parameters, fault_mode, is_observation_mode
@@ -320,5 +320,4 @@ def single_process(nodes: Sequence[Node]) -> Process:
         start = namespace_rule(node.namespace)
         arguments += ros_arguments(start, f"{node.name}:", node.parameters)
     arguments += ros_arguments([], "", {}, nodes[0].common())
-    module = ("-m", "crash_coach_common.executable", "crash_coach_bringup.ros.single")
-    return Process("graph", (sys.executable, *module, *arguments))
+    return Process("graph", (*command("crash_coach_bringup.ros.single"), *arguments))

@@ -69,9 +69,13 @@ def overrides(node: Node) -> list[Parameter]:
 
 def overridden(node: Node, topic: str, entity: Entity) -> tuple[str, ...]:
     """The policies of ``topic`` that were overridden for the node."""
-    begin = f"{PREFIX}{node.resolve_topic_name(topic)}.{entity}."
+    begin = _begin(node, topic, entity)
     names = [parameter.name for parameter in overrides(node)]
     return tuple(name.removeprefix(begin) for name in names if name.startswith(begin))
+
+
+def _begin(node: Node, topic: str, entity: Entity) -> str:
+    return f"{PREFIX}{node.resolve_topic_name(topic)}.{entity}."
 
 
 def tell_unused(nodes: Iterable[Node]) -> None:
@@ -86,8 +90,7 @@ def _asked(
     node: Node, topic: str, entity: Entity, qos: QoSProfile | int
 ) -> tuple[QoSProfile | int, QoSOverridingOptions]:
     policies = overridden(node, topic, entity)
-    begin = f"{PREFIX}{node.resolve_topic_name(topic)}.{entity}."
-    _used.update(begin + policy for policy in policies)
+    _used.update(_begin(node, topic, entity) + policy for policy in policies)
     # rclpy changes the profile, of which others have the same object.
     own = qos if isinstance(qos, int) else copy(qos)
     return own, QoSOverridingOptions([_POLICIES[policy] for policy in policies])

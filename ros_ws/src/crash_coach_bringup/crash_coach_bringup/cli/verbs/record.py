@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,9 +10,9 @@ from typing import Annotated, Any
 import typer
 
 from crash_coach_bringup.cli.output import CliError
+from crash_coach_common.executable import command
 from sim_pkg.env import make_env
 
-EXECUTABLE = "crash_coach_common.executable"
 MODULE = "policy_pkg.ros.recorder_node"
 
 
@@ -88,5 +87,5 @@ def record(
     from crash_coach_bringup.ros.graph import ros_arguments
 
     # In place of this process: signals reach the recorder itself, from its first moment.
-    command = [sys.executable, "-m", EXECUTABLE, MODULE, *ros_arguments([], "", parameters)]
-    os.execv(sys.executable, command)
+    started = command(MODULE)
+    os.execv(started[0], [*started, *ros_arguments([], "", parameters)])
