@@ -18,7 +18,8 @@ import torch
 
 from benchmarks.numpy_learner.learner import NumpyLearner
 from crash_coach_pkg.coach.coach import Coach
-from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.config import CoachConfig
+from crash_coach_pkg.team import TeamSpec
 from policy_pkg.episode import Sizes
 from policy_pkg.learner.config import LearnerConfig
 from policy_pkg.learner.learner import Learner

@@ -27,7 +27,7 @@ from crash_coach_bringup.ros.graph import (
     graph_processes,
 )
 from crash_coach_bringup.ros.supervisor import Supervisor
-from crash_coach_pkg.coach.config import TeamSpec
+from crash_coach_pkg.team import TeamSpec
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 from hypothesis import settings
+from shared_memory import remove_left_behind
 
 from crash_coach_bringup.ros import discovery
 from crash_coach_bringup.ros.domain import reserve_domain
@@ -19,6 +20,11 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # How long an example takes says how busy the machine is.
 settings.register_profile("here", deadline=None)
 settings.load_profile("here")
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    if not hasattr(session.config, "workerinput"):  # once, before pytest-xdist's workers
+        remove_left_behind()
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from enum import IntEnum
-from typing import Any
+from typing import Any, Protocol
 
 NEXT_STEP = 0xFFFFFFFF
 """A start step that the gate resolves to the first step it has not relayed anything of."""
@@ -106,3 +106,11 @@ def _fault_from_json(values: dict[str, Any]) -> Fault:
     kind, numbers = TriggerKind(values["trigger"]["kind"]), values["trigger"]["values"]
     trigger = Trigger(kind, tuple(numbers))
     return Fault(**{**values, "parameters": parameters, "trigger": trigger})
+
+
+class Planner(Protocol):
+    """What decides the faults of each episode: a Coach, or a fault scenario's planner."""
+
+    def plan(self, episode: int) -> CrashPlan:
+        """Of ``episode``: the same whenever, and in whatever order, it is asked for."""
+        ...

@@ -9,8 +9,8 @@ import pytest
 from in_process import typed
 
 from crash_coach_bringup.cli.playing import ALIKE
-from crash_coach_pkg.coach.config import TeamSpec
 from crash_coach_pkg.coach.fault_scenario import ScenarioPlanner, load_fault_scenario
+from crash_coach_pkg.team import TeamSpec
 from sim_pkg.env import make_env
 
 HOLD = ("--policy", "scripted:hold", "--scenario", "buttons", "--episodes", "3")

@@ -12,11 +12,12 @@ from typer.testing import CliRunner
 from crash_coach_bringup.cli.faults.docs import BLOCK, SET_LINES, generated, update
 from crash_coach_bringup.cli.faults.verb import app
 from crash_coach_bringup.cli.output import CliError
-from crash_coach_pkg.coach.config import FaultConfig, TeamSpec
+from crash_coach_pkg.coach.config import FaultConfig
 from crash_coach_pkg.coach.expectations import Expectation
 from crash_coach_pkg.coach.fault_scenario import load_fault_scenario
 from crash_coach_pkg.coach.parameters import build_settings, check_change, parameter_specs
 from crash_coach_pkg.faults import fault_mode, mode_names
+from crash_coach_pkg.team import TeamSpec
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "faults.md"
 TEAM = TeamSpec(("robot_1", "robot_2"), ("robot", "robot"), 0.5)

@@ -16,13 +16,13 @@ from crash_coach_bringup.cli.faults.verb import app
 from crash_coach_bringup.cli.options import Layout, Via
 from crash_coach_bringup.ros.probe import find_executable
 from crash_coach_common.contract import UserError
-from crash_coach_pkg.coach.config import TeamSpec
 from crash_coach_pkg.coach.fault_scenario import (
     ScenarioPlanner,
     fault_scenario_names,
     find_fault_scenario,
     load_fault_scenario,
 )
+from crash_coach_pkg.team import TeamSpec
 from policy_pkg.play.conditions import crash_free
 from policy_pkg.play.evaluate import evaluate, evaluation_seed
 from policy_pkg.play.target import Target, load_target

@@ -16,9 +16,10 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 from crash_coach_common.contract import UserError
 from crash_coach_pkg.coach.coach import Coach
-from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.config import CoachConfig
 from crash_coach_pkg.faults import mode_names
 from crash_coach_pkg.faults.batch_faults import RANDOM_CODE, apply_faults
+from crash_coach_pkg.team import TeamSpec
 from crash_coach_pkg.wrappers import CrashWrapper, MultiAgentView
 from sim_pkg.pettingzoo import ParallelArena
 

@@ -12,8 +12,8 @@ from console_teams import WAIT_S, Teams, asking, console, deaf_page, messages
 from hypothesis import given, seed, settings
 
 from crash_coach_bringup.ros.graph import graph_environment
-from crash_coach_pkg.coach.config import TeamSpec
 from crash_coach_pkg.coach.parameters import build_settings
+from crash_coach_pkg.team import TeamSpec
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

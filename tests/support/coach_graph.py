@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import array
 import os
-import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,6 +20,7 @@ from crash_coach_interfaces.msg import Action, CrashPlan, EpisodeState, FaultEve
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from shared_memory import kill_group
 
 # Read when a process creates its first participant; children inherit it.
 os.environ.setdefault(
@@ -72,8 +72,7 @@ def process(
     try:
         yield child
     finally:
-        if child.poll() is None:
-            os.killpg(child.pid, signal.SIGKILL)
+        kill_group(child)
         child.communicate(timeout=WAIT_S)
 
 

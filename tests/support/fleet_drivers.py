@@ -98,8 +98,14 @@ class Drivers(threading.Thread):
     def until(self, done: Callable[[], bool], what: str, timeout_s: float = WAIT_S) -> None:
         end = time.monotonic() + timeout_s
         while not done():
-            assert time.monotonic() < end, f"not within {timeout_s} s: {what}"
+            assert time.monotonic() < end, f"not within {timeout_s} s: {what} ({self.heard()})"
             time.sleep(0.005)
+
+    def heard(self) -> str:
+        """Of each rover: subscribers to what it is told, commands got, and whether it tells."""
+        told = {name: publisher.get_subscription_count() for name, publisher in self._raws.items()}
+        got = {name: len(self.got[name]) for name in ROVERS}
+        return f"subscribers {told}, got {got}, odometry of {sorted(self.odometry)}"
 
     def drive_on(self, commands: int = 10) -> None:
         """Waits until so many more commands were sent to each rover."""

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-GONE_S = 60.0
+from shared_memory import kill_group
 
 
 @contextmanager
@@ -22,6 +20,4 @@ def kept_running(
         yield
         assert child.poll() is None, f"it ended: {' '.join(command)}"
     finally:
-        if child.poll() is None:
-            os.killpg(child.pid, signal.SIGKILL)
-        child.wait(timeout=GONE_S)
+        kill_group(child)

@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from crash_coach_pkg.coach.coach import Coach
-from crash_coach_pkg.coach.config import TeamSpec
 from crash_coach_pkg.coach.strategies.base import Progress
 from crash_coach_pkg.plan import CrashPlan
+from crash_coach_pkg.team import TeamSpec
 from policy_pkg.agent import Sensed
 from policy_pkg.bags.dataset import RecordedEpisode
 from policy_pkg.episode import Episode

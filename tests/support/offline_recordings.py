@@ -9,7 +9,8 @@ import numpy.typing as npt
 from reference_learner import random_episode
 
 from crash_coach_pkg.coach.coach import Coach
-from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.config import CoachConfig
+from crash_coach_pkg.team import TeamSpec
 from policy_pkg.episode import Episode, Sizes
 from policy_pkg.learner.config import LearnerConfig
 from policy_pkg.learner.learner import Learner

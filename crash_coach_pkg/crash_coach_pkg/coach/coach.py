@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
 from crash_coach_common.contract import BoolArray, EnvSpec, UserError
-from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.config import CoachConfig
 from crash_coach_pkg.coach.draws import among, check_team, draw_faults, draw_victims, most_crashed
 from crash_coach_pkg.coach.strategies import find_strategy, make_strategy, strategy_names
 from crash_coach_pkg.coach.strategies.base import (
@@ -20,17 +20,10 @@ from crash_coach_pkg.coach.strategies.base import (
     State,
 )
 from crash_coach_pkg.coach.victims import episode_rng
-from crash_coach_pkg.plan import CrashPlan
+from crash_coach_pkg.plan import CrashPlan, Planner
+from crash_coach_pkg.team import TeamSpec
 
 Decision = Literal["raise", "lower", "keep"]
-
-
-class Planner(Protocol):
-    """What decides the faults of each episode: a Coach, or a fault scenario's planner."""
-
-    def plan(self, episode: int) -> CrashPlan:
-        """Of ``episode``: the same whenever, and in whatever order, it is asked for."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,11 @@ import math
 import numpy as np
 
 from crash_coach_common.contract import BoolArray, UserError
-from crash_coach_pkg.coach.config import FaultConfig, TeamSpec
+from crash_coach_pkg.coach.config import FaultConfig
 from crash_coach_pkg.coach.victims import draw_exactly
 from crash_coach_pkg.faults import fault_mode
 from crash_coach_pkg.plan import AT_START_STEP, Fault, Trigger, TriggerKind
+from crash_coach_pkg.team import TeamSpec
 
 
 def draw_victims(config: FaultConfig, team: TeamSpec, rng: np.random.Generator) -> BoolArray:

@@ -21,7 +21,7 @@ from crash_coach_common.strict_yaml import (
     shipped_names,
     validate,
 )
-from crash_coach_pkg.coach.config import FaultConfig, TeamSpec
+from crash_coach_pkg.coach.config import FaultConfig
 from crash_coach_pkg.coach.draws import (
     check_team,
     draw_faults,
@@ -33,6 +33,7 @@ from crash_coach_pkg.coach.expectations import Expectation
 from crash_coach_pkg.faults import unmet_needs
 from crash_coach_pkg.faults.base import Need
 from crash_coach_pkg.plan import CrashPlan, Fault
+from crash_coach_pkg.team import TeamSpec
 
 FAULTS_DIR = Path(__file__).parents[1] / "configs" / "faults"
 _STREAM = 0xFA017  # keeps the draws of a file's entries apart from the coach's

@@ -8,10 +8,11 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from crash_coach_common.contract import UserError
-from crash_coach_pkg.coach.coach import BlockRecord, Coach, Planner
-from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.coach import BlockRecord, Coach
+from crash_coach_pkg.coach.config import CoachConfig
 from crash_coach_pkg.coach.strategies.base import Progress
-from crash_coach_pkg.plan import NEXT_STEP, CrashPlan
+from crash_coach_pkg.plan import NEXT_STEP, CrashPlan, Planner
+from crash_coach_pkg.team import TeamSpec
 
 
 class ControlSettings(BaseModel):

@@ -14,12 +14,13 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from crash_coach_common.contract import UserError
-from crash_coach_pkg.coach.config import FURTHEST_M, HIGHEST_RETURN, CoachConfig, TeamSpec
+from crash_coach_pkg.coach.config import FURTHEST_M, HIGHEST_RETURN, CoachConfig
 from crash_coach_pkg.coach.draws import check_team
 from crash_coach_pkg.coach.live_coach import ControlSettings
 from crash_coach_pkg.coach.strategies import find_strategy, make_strategy, strategy_names
 from crash_coach_pkg.coach.strategies.base import Candidates
 from crash_coach_pkg.faults import SYNONYMS, check_parameters, fault_mode, mode_names
+from crash_coach_pkg.team import TeamSpec
 
 Value = bool | int | float | str | Sequence[str] | Sequence[float]
 NOBODY = "none"

@@ -34,8 +34,6 @@ from crash_coach_common.ros.parameters import (
 )
 from crash_coach_common.ros.qos_node import QosNode
 from crash_coach_common.ros.run_node import SPIN_S, spin
-from crash_coach_pkg.coach.coach import Planner
-from crash_coach_pkg.coach.config import TeamSpec
 from crash_coach_pkg.coach.fault_scenario import (
     ScenarioPlanner,
     find_fault_scenario,
@@ -55,9 +53,11 @@ from crash_coach_pkg.coach.parameters import (
 )
 from crash_coach_pkg.faults import is_observation_mode
 from crash_coach_pkg.gate.plan_book import not_relayed
+from crash_coach_pkg.plan import Planner
 from crash_coach_pkg.ros.coach_link import CoachLink
 from crash_coach_pkg.ros.endpoints import leaves_observations
 from crash_coach_pkg.ros.robot_names import robot_names
+from crash_coach_pkg.team import TeamSpec
 
 
 class CoachNode(QosNode):

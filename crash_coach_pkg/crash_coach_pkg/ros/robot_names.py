@@ -8,7 +8,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from crash_coach_common.contract import UserError
-from crash_coach_pkg.coach.config import check_robots
+from crash_coach_pkg.team import check_robots
 
 
 def robot_names(node: Node) -> tuple[str, ...]:

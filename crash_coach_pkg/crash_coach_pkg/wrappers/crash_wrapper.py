@@ -13,13 +13,14 @@ from pettingzoo.utils import BaseParallelWrapper
 
 from crash_coach_common.contract import BoolArray, UserError
 from crash_coach_pkg.coach.coach import BlockRecord, Coach
-from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.config import CoachConfig
 from crash_coach_pkg.coach.strategies.base import Progress
 from crash_coach_pkg.faults import is_observation_mode, unmet_needs
 from crash_coach_pkg.faults.action_tools import ACTION_OFFERS, UNTOLD, ActionTools
 from crash_coach_pkg.faults.team_faults import TeamFaults
 from crash_coach_pkg.plan import CrashPlan, TriggerKind
 from crash_coach_pkg.schedule import World
+from crash_coach_pkg.team import TeamSpec
 from crash_coach_pkg.wrappers.masked import OBSERVATION, inner, inner_space, is_masked, mask_of
 
 

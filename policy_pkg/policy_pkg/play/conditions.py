@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
-from crash_coach_pkg.coach.coach import Planner
-from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.config import CoachConfig
 from crash_coach_pkg.faults import fault_mode
+from crash_coach_pkg.plan import Planner
+from crash_coach_pkg.team import TeamSpec
 
 Parameters = Mapping[str, float]
 NO_PARAMETERS: Parameters = MappingProxyType({})

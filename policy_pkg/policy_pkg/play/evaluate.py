@@ -10,10 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from crash_coach_common.contract import BatchEnv, EnvSpec, IntArray, UserError
-from crash_coach_pkg.coach.coach import Coach, Planner
-from crash_coach_pkg.coach.config import TeamSpec
+from crash_coach_pkg.coach.coach import Coach
 from crash_coach_pkg.effects import EffectRow
 from crash_coach_pkg.faults import unmet_needs
+from crash_coach_pkg.plan import Planner
+from crash_coach_pkg.team import TeamSpec
 from policy_pkg.checkpoint import PolicyBundle
 from policy_pkg.play.arenas import ArenaArray, Arenas, Executed
 from policy_pkg.play.conditions import Condition, Planned

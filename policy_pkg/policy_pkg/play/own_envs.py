@@ -13,7 +13,8 @@ from typing import Any
 import gymnasium
 
 from crash_coach_pkg.coach.coach import Coach
-from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.config import CoachConfig
+from crash_coach_pkg.team import TeamSpec
 from crash_coach_pkg.wrappers import CrashWrapper, MultiAgentView
 from crash_coach_pkg.wrappers.crash_wrapper import coach_settings
 from sim_pkg.pettingzoo import ParallelArena

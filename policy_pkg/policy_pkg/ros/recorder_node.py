@@ -13,10 +13,11 @@ from ament_index_python.packages import PackageNotFoundError, get_package_share_
 from crash_coach_interfaces.msg import Action, CrashPlan, EpisodeState, FaultEvent, Observation
 from nav_msgs.msg import Odometry
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from crash_coach_common.contract import UserError
+from crash_coach_common.ros.qos import DEEP, DEEP_LATCHED
 from crash_coach_common.ros.qos_node import QosNode
 from crash_coach_common.ros.run_node import run, serving
 from policy_pkg.bags.about import About
@@ -28,7 +29,6 @@ from policy_pkg.ros.recorder_params import RecorderParameters, read_parameters
 PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 PROFILE = Path(__file__).with_name("recorder_fastdds.xml")
 SPIN_S = 0.1  # how soon a signal is noticed
-_DEPTH = 2000  # of each topic: what may wait for this process while it is not scheduled
 _LINGER_S = 0.5  # for what is still on its way when the last episode's end is here
 _LOOK_S = 1.0  # how often drops are told
 _CLASSES = {
@@ -134,10 +134,7 @@ def _interfaces() -> Path:
 
 def _qos(connection: Connection) -> QoSProfile:
     """Reliable, and deep: a publisher in lock-step does not wait for the recorder."""
-    durability = DurabilityPolicy.TRANSIENT_LOCAL if connection.latched else None
-    if durability is None:
-        return QoSProfile(depth=_DEPTH)
-    return QoSProfile(depth=_DEPTH, durability=durability)
+    return DEEP_LATCHED if connection.latched else DEEP
 
 
 def _list(drops: dict[str, int]) -> str:

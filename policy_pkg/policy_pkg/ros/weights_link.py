@@ -6,16 +6,14 @@ from collections.abc import Callable, Sequence
 
 from crash_coach_interfaces.msg import PolicyStatus, PolicyWeights
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from crash_coach_common.contract import UserError
+from crash_coach_common.ros.qos import WEIGHTS, WEIGHTS_STATUS, latched
 from policy_pkg.agent import Answer, Sensed
 from policy_pkg.live_weights import LiveAgent, Weights
 
 WEIGHTS_TOPIC = "trainer/weights"
 STATUS_TOPIC = "trainer/policies"
-WEIGHTS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-STATUS = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 Receive = Callable[[int, Sensed[bytes]], list[Answer[bytes]]]
 
 
@@ -36,12 +34,8 @@ class WeightsLink:
         self._node, self._robots, self._act_for = node, robots, act_for
         self._live: LiveAgent[bytes] | None = None
         # The last word of every robot that this node drives.
-        depth = max(1, len(robots)) if robots else STATUS.depth
-        self._status = node.create_publisher(
-            PolicyStatus,
-            STATUS_TOPIC,
-            QoSProfile(depth=depth, durability=DurabilityPolicy.TRANSIENT_LOCAL),
-        )
+        depth = max(1, len(robots)) if robots else WEIGHTS_STATUS.depth
+        self._status = node.create_publisher(PolicyStatus, STATUS_TOPIC, latched(depth))
         node.create_subscription(PolicyWeights, WEIGHTS_TOPIC, self._on_weights, WEIGHTS)
 
     def _on_weights(self, message: PolicyWeights) -> None:

@@ -24,7 +24,7 @@ from crash_coach_common.strict_yaml import (
     validate,
 )
 from crash_coach_pkg.coach.coach import Coach
-from crash_coach_pkg.coach.config import TeamSpec
+from crash_coach_pkg.team import TeamSpec
 from policy_pkg.train.config import (
     CONFIGS_DIR,
     SWEEPS,

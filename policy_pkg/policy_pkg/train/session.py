@@ -8,11 +8,11 @@ import numpy as np
 
 from crash_coach_common.contract import BatchEnv, EnvSpec, UserError
 from crash_coach_pkg.coach.coach import BlockRecord, Coach
-from crash_coach_pkg.coach.config import TeamSpec
 from crash_coach_pkg.coach.strategies.base import Progress
 from crash_coach_pkg.faults import unmet_needs
 from crash_coach_pkg.faults.action_tools import ACTION_OFFERS
 from crash_coach_pkg.plan import CrashPlan
+from crash_coach_pkg.team import TeamSpec
 from policy_pkg.episode import Episode, Sizes
 from policy_pkg.learner.learner import Learner
 from policy_pkg.learner.replay import Replay

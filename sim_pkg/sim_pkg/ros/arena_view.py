@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 from crash_coach_interfaces.msg import Arena, ArenaState
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 
 from crash_coach_common.contract import BoolArray, FloatArray
+from crash_coach_common.ros.qos import ARENA, NEWEST
 from sim_pkg.env import Env
 from sim_pkg.render.frames import actors, vitals, walled_m
 from sim_pkg.session import Session
@@ -92,14 +92,13 @@ class ArenaView:
     def __init__(
         self, node: Node, env: Env, lockstep: bool, hz: float, clock_s: Callable[[], float]
     ) -> None:
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._clock_s = clock_s
         self._period_s = 1 / hz
         self._due_s = 0.0
         self._listened = self._pending = False
         self._header = Header(frame_id="map")
-        self._arena_pub = node.create_publisher(Arena, ARENA_TOPIC, latched)
-        self._state_pub = node.create_publisher(ArenaState, ARENA_STATE_TOPIC, QoSProfile(depth=1))
+        self._arena_pub = node.create_publisher(Arena, ARENA_TOPIC, ARENA)
+        self._state_pub = node.create_publisher(ArenaState, ARENA_STATE_TOPIC, NEWEST)
         self._arena_pub.publish(arena_message(env, lockstep, self._header))
 
     def refresh_listeners(self) -> None:

@@ -9,13 +9,14 @@ from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from crash_coach_common.contract import EnvSpec, UserError
 from crash_coach_common.ros.peers import several
+from crash_coach_common.ros.qos import latched
 from crash_coach_common.ros.team_topics import COMMANDS, OBSERVATIONS, TeamPublisher, subscribe
 from crash_coach_common.team_cdr import RobotMessage
 from sim_pkg.lockstep import Decisions
@@ -30,10 +31,6 @@ EPISODE_TOPIC = "sim/episode"
 BOUNDARY_TOPIC = "sim/boundary"
 EVENTS_TOPIC = "coach/events"
 _ACK_TIMEOUT_S = 5.0
-
-
-def _reliable(depth: int) -> QoSProfile:
-    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE)
 
 
 class SimTopics:
@@ -59,25 +56,21 @@ class SimTopics:
         self._episode = convert.EpisodeWriter(spec, seed, self._header)
         self._clock = Clock(clock=self._header.stamp)
         # A whole episode, so that a reader that falls behind within one loses nothing of it.
-        latched = QoSProfile(
-            depth=spec.episode_limit + 1,
-            reliability=ReliabilityPolicy.RELIABLE,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL,
-        )
+        episode = latched(spec.episode_limit + 1)
         pub = node.create_publisher
-        self._episode_pub = pub(EpisodeState, EPISODE_TOPIC, latched)
-        self._boundary_pub = pub(EpisodeState, BOUNDARY_TOPIC, latched)
-        self._clock_pub = pub(Clock, "clock", _reliable(10))
-        self._markers_pub = pub(MarkerArray, "sim/markers", _reliable(10))
-        self._diagnostics_pub = pub(DiagnosticArray, "diagnostics", _reliable(10))
+        self._episode_pub = pub(EpisodeState, EPISODE_TOPIC, episode)
+        self._boundary_pub = pub(EpisodeState, BOUNDARY_TOPIC, episode)
+        self._clock_pub = pub(Clock, "clock", QoSProfile(depth=10))
+        self._markers_pub = pub(MarkerArray, "sim/markers", QoSProfile(depth=10))
+        self._diagnostics_pub = pub(DiagnosticArray, "diagnostics", QoSProfile(depth=10))
         observed = [f"{robot}/observation" for robot in spec.robots]
         self._obs_pub = TeamPublisher(node, OBSERVATIONS, spec.robots, observed, "observation")
-        self._odom_pubs = [pub(Odometry, f"{r}/odom", _reliable(10)) for r in spec.robots]
+        self._odom_pubs = [pub(Odometry, f"{r}/odom", QoSProfile(depth=10)) for r in spec.robots]
         commanded = [f"{robot}/command" for robot in spec.robots]
         self._command_subs = subscribe(
             node, COMMANDS, spec.robots, commanded, "command", on_commands, on_error, lockstep
         )
-        node.create_subscription(FaultEvent, EVENTS_TOPIC, on_event, _reliable(100))
+        node.create_subscription(FaultEvent, EVENTS_TOPIC, on_event, QoSProfile(depth=100))
         self._transforms = Transforms(node, spec.robots, convert.MAP_FRAME)
         self._draw = False
         self._odom: list[int] = []

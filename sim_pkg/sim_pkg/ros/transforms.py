@@ -9,9 +9,10 @@ from collections.abc import Sequence
 
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import QoSProfile
 from std_msgs.msg import Header
 
+from crash_coach_common.ros.qos import latched
 from sim_pkg.session import Session
 
 try:
@@ -22,7 +23,7 @@ except ImportError:
 BASE_LINK = "base_link"
 # As tf2_ros' listeners and broadcasters have it.
 _DYNAMIC = QoSProfile(depth=100)
-_STATIC = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_STATIC = latched()
 
 
 class Transforms:

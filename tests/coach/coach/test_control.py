@@ -8,10 +8,11 @@ from typing import Any
 import pytest
 
 from crash_coach_common.contract import UserError
-from crash_coach_pkg.coach.config import CoachConfig, TeamSpec, check_robots
+from crash_coach_pkg.coach.config import CoachConfig
 from crash_coach_pkg.coach.live_coach import Control, ControlSettings
 from crash_coach_pkg.coach.parameters import build_settings, parameter_specs
 from crash_coach_pkg.plan import NEXT_STEP, CrashPlan, Fault
+from crash_coach_pkg.team import TeamSpec, check_robots
 
 TEAM = TeamSpec(("robot_1", "robot_2", "robot_3"), ("scout", "scout", "hauler"), 0.1)
 DEFAULTS = {spec.name: spec.default for spec in parameter_specs()}

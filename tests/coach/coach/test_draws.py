@@ -14,10 +14,11 @@ from pydantic import ValidationError
 
 from crash_coach_common.contract import UserError
 from crash_coach_pkg.coach.coach import Coach
-from crash_coach_pkg.coach.config import CoachConfig, FaultConfig, TeamSpec
+from crash_coach_pkg.coach.config import CoachConfig, FaultConfig
 from crash_coach_pkg.coach.draws import check_team, draw_faults, draw_victims
 from crash_coach_pkg.plan import Trigger, TriggerKind
 from crash_coach_pkg.schedule import Schedule
+from crash_coach_pkg.team import TeamSpec
 from sim_pkg.env import make_env
 
 ROBOTS = tuple(f"robot_{i + 1}" for i in range(5))

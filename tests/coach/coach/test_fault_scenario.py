@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crash_coach_common.contract import UserError
-from crash_coach_pkg.coach.config import TeamSpec
 from crash_coach_pkg.coach.fault_scenario import (
     FaultScenario,
     ScenarioPlanner,
@@ -20,6 +19,7 @@ from crash_coach_pkg.coach.fault_scenario import (
 )
 from crash_coach_pkg.plan import CrashPlan, TriggerKind
 from crash_coach_pkg.schedule import Schedule
+from crash_coach_pkg.team import TeamSpec
 
 TEAM = TeamSpec(
     ("robot_1", "robot_2", "robot_3", "robot_4"), ("scout", "scout", "lifter", "lifter"), 0.5

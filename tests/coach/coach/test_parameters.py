@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from crash_coach_common.contract import UserError
-from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.config import CoachConfig
 from crash_coach_pkg.coach.live_coach import ControlSettings
 from crash_coach_pkg.coach.parameters import (
     START_SPECS,
@@ -20,6 +20,7 @@ from crash_coach_pkg.coach.parameters import (
 )
 from crash_coach_pkg.coach.strategies import find_strategy, strategy_names
 from crash_coach_pkg.faults import fault_mode, mode_names
+from crash_coach_pkg.team import TeamSpec
 
 TEAM = TeamSpec(("robot_1", "robot_2", "robot_3"), ("scout", "scout", "hauler"), 0.1)
 DEFAULTS = {spec.name: spec.default for spec in parameter_specs()}

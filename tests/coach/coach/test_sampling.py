@@ -11,11 +11,12 @@ import pytest
 from pydantic import ValidationError
 
 from crash_coach_pkg.coach.coach import Coach
-from crash_coach_pkg.coach.config import CapRule, CoachConfig, TeamSpec
+from crash_coach_pkg.coach.config import CapRule, CoachConfig
 from crash_coach_pkg.coach.draws import most_crashed
 from crash_coach_pkg.coach.strategies import strategy_names
 from crash_coach_pkg.coach.victims import crash_cap, draw_exactly, draw_mask, episode_rng
 from crash_coach_pkg.plan import AT_START_STEP
+from crash_coach_pkg.team import TeamSpec
 
 TEAM = TeamSpec(tuple(f"robot_{i + 1}" for i in range(8)))
 

@@ -12,10 +12,11 @@ import pytest
 from crash_coach_common import plugins
 from crash_coach_pkg.coach import strategies
 from crash_coach_pkg.coach.coach import Coach
-from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.config import CoachConfig
 from crash_coach_pkg.coach.strategies import find_strategy, strategy_names
 from crash_coach_pkg.coach.strategies.base import BlockOver, Draws, Progress, State, Strategy
 from crash_coach_pkg.plan import CrashPlan
+from crash_coach_pkg.team import TeamSpec
 
 TEAM = TeamSpec(("robot_1", "robot_2", "robot_3"))
 NOWHERE = Progress(env_steps=0, total_steps=0, episodes=0)

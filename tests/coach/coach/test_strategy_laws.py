@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 
 from crash_coach_pkg.coach.coach import Coach
-from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.config import CoachConfig
 from crash_coach_pkg.coach.strategies import find_strategy, settings_of, strategy_names
 from crash_coach_pkg.coach.strategies.base import Candidates, Draws, EpisodeOver, Progress
 from crash_coach_pkg.coach.strategies.deck import Deck, DeckSettings
 from crash_coach_pkg.coach.strategies.failure import Failure, FailureSettings
 from crash_coach_pkg.coach.strategies.learnability import Learnability, LearnabilitySettings
+from crash_coach_pkg.team import TeamSpec
 
 DRAWS = 100_000
 WHERE = Progress(env_steps=500, total_steps=1000, episodes=50)

@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.config import CoachConfig
 from crash_coach_pkg.coach.live_coach import Control, ControlSettings
 from crash_coach_pkg.gate.action_gate import GateState
 from crash_coach_pkg.gate.messages import Command, Decision, Sight
 from crash_coach_pkg.gate.plan_book import Event, EventKind
 from crash_coach_pkg.schedule import World
+from crash_coach_pkg.team import TeamSpec
 
 TEAM = TeamSpec(("robot_1", "robot_2", "robot_3"), dt_s=0.1)
 STEPS = 40

@@ -11,7 +11,7 @@ import pytest
 
 from crash_coach_common.contract import UserError
 from crash_coach_pkg.coach.coach import Coach
-from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.config import CoachConfig
 from crash_coach_pkg.effects import OBSERVED, WITHHELD, EffectRow
 from crash_coach_pkg.faults import mode_names
 from crash_coach_pkg.plan import (
@@ -22,6 +22,7 @@ from crash_coach_pkg.plan import (
     plan_from_json,
     plan_to_json,
 )
+from crash_coach_pkg.team import TeamSpec
 from policy_pkg.episode import Sizes
 from policy_pkg.learner.config import LearnerConfig
 from policy_pkg.learner.learner import Learner

@@ -13,8 +13,9 @@ import numpy.typing as npt
 import pytest
 
 from crash_coach_pkg.coach.coach import Coach
-from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.config import CoachConfig
 from crash_coach_pkg.plan import CrashPlan
+from crash_coach_pkg.team import TeamSpec
 from policy_pkg.checkpoint import CheckpointError
 from policy_pkg.episode import Sizes
 from policy_pkg.learner.config import LearnerConfig

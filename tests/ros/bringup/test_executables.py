@@ -23,7 +23,7 @@ from crash_coach_bringup.ros.graph import (
     node_process,
 )
 from crash_coach_bringup.ros.launch_arguments import ARGUMENTS, options_from
-from crash_coach_pkg.coach.config import TeamSpec
+from crash_coach_pkg.team import TeamSpec
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 

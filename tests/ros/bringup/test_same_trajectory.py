@@ -23,8 +23,8 @@ from fault_files import (
 
 from crash_coach_bringup.ros.evaluation import evaluate_via_ros
 from crash_coach_bringup.ros.graph import Layout
-from crash_coach_pkg.coach.config import TeamSpec
 from crash_coach_pkg.coach.fault_scenario import ScenarioPlanner, load_fault_scenario
+from crash_coach_pkg.team import TeamSpec
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.play.conditions import Condition, Planned, at_rate, crash_free, named
 from policy_pkg.play.evaluate import Evaluation, evaluate

@@ -13,9 +13,10 @@ from coach_graph import ROBOTS, Graph, Team, graph, operator, process, run_to_en
 from crash_coach_interfaces.msg import CrashPlan, FaultEvent
 
 from crash_coach_pkg.coach.coach import Coach
-from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.config import CoachConfig
 from crash_coach_pkg.coach.live_coach import Control, ControlSettings
 from crash_coach_pkg.coach.parameters import START_SPECS, parameter_specs
+from crash_coach_pkg.team import TeamSpec
 
 
 def new_plan(team: Team, wanted: Callable[[CrashPlan], bool], what: str) -> CrashPlan:

@@ -12,7 +12,7 @@ from coach_graph import ROBOTS, Team, graph, operator, process, run_to_end, team
 from crash_coach_interfaces.msg import Action, CrashPlan, Fault, FaultEvent
 
 from crash_coach_pkg.coach.coach import Coach
-from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.config import CoachConfig
 from crash_coach_pkg.coach.fault_scenario import (
     ScenarioPlanner,
     find_fault_scenario,
@@ -20,6 +20,7 @@ from crash_coach_pkg.coach.fault_scenario import (
 )
 from crash_coach_pkg.gate.action_gate import GateState
 from crash_coach_pkg.gate.messages import Command, Decision
+from crash_coach_pkg.team import TeamSpec
 
 SEED = 5
 STEPS = 24

@@ -15,11 +15,11 @@ from rclpy.parameter import parameter_value_to_python
 from sim_driver import Driver, sim
 
 from crash_coach_pkg.coach.coach import Coach
-from crash_coach_pkg.coach.config import TeamSpec
 from crash_coach_pkg.coach.live_coach import ControlSettings
 from crash_coach_pkg.coach.parameters import Value, build_settings, parameter_specs
 from crash_coach_pkg.faults import mode_names
 from crash_coach_pkg.ros.convert import plan_from_message
+from crash_coach_pkg.team import TeamSpec
 
 TEAM = TeamSpec(ROBOTS, ("scout", "scout", "hauler"), 0.1)
 WORDS = (

@@ -20,6 +20,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node as RclNode
 from rclpy.qos import QoSProfile
+from shared_memory import kill_group
 
 from crash_coach_bringup.ros.graph import Node, node_process
 from policy_pkg.untrained import write_untrained
@@ -66,14 +67,14 @@ def fuzzed(env: dict[str, str], executable: str, **parameters: Any) -> Iterator[
         stderr=subprocess.STDOUT,
         text=True,
         env=env,
+        start_new_session=True,
     )
     node = RclNode("fuzzer", context=context)
     one = Fuzzed(process, node)
     try:
         yield one
     finally:
-        if process.poll() is None:
-            process.kill()
+        kill_group(process)
         process.communicate(timeout=10)
         one.executor.shutdown()
         node.destroy_node()

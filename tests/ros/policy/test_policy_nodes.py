@@ -16,6 +16,7 @@ from crash_coach_interfaces.msg import Action, Observation
 from policy_team import ALL, OBS, ROBOTS, SPEC, make_agent, sense
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
+from shared_memory import kill_group
 
 from crash_coach_bringup.ros.client import GraphClient, graph_client
 from crash_coach_bringup.ros.graph import Node, node_process
@@ -75,12 +76,12 @@ def running(node: Node, env: dict[str, str]) -> Iterator[subprocess.Popen[str]]:
         stderr=subprocess.STDOUT,
         text=True,
         env=env,
+        start_new_session=True,
     )
     try:
         yield child
     finally:
-        if child.poll() is None:
-            child.kill()
+        kill_group(child)
         child.communicate(timeout=10)
 
 

@@ -21,22 +21,19 @@ from crash_coach_interfaces.msg import (
 )
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 
 from crash_coach_common.contract import EnvSpec
-from crash_coach_common.ros.qos import BLOCKS
+from crash_coach_common.ros.qos import BLOCKS, DEEP, DEEP_LATCHED, WEIGHTS, WEIGHTS_STATUS
 from policy_pkg.bags.decode import key_of
 from policy_pkg.bags.records import Channel
 from policy_pkg.bags.topics import TYPES, Kind
 from policy_pkg.ros.convert import fault_from_bytes, sensed_from_bytes
-from policy_pkg.ros.weights_link import STATUS, STATUS_TOPIC, WEIGHTS, WEIGHTS_TOPIC
+from policy_pkg.ros.weights_link import STATUS_TOPIC, WEIGHTS_TOPIC
 from policy_pkg.train.live.inbox import Inbox
 
 BLOCKS_TOPIC = "trainer/blocks"
 # A sim in lock-step does not wait for this process, whose threads share one interpreter.
-DEEP = QoSProfile(depth=2000)
-DEEP_LATCHED = QoSProfile(depth=2000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 @dataclass(frozen=True)
@@ -100,7 +97,7 @@ class TrainerTopics:
         )
         node.create_subscription(CrashPlan, "coach/plan", self._on_plan, DEEP_LATCHED)
         node.create_subscription(FaultEvent, "coach/events", self._on_event, DEEP)
-        node.create_subscription(PolicyStatus, STATUS_TOPIC, heard.status, STATUS)
+        node.create_subscription(PolicyStatus, STATUS_TOPIC, heard.status, WEIGHTS_STATUS)
 
     def missing(self, coached: bool) -> list[str]:
         """Robots without anybody who commands them; with ``coached``, a coach that hears blocks."""

@@ -8,13 +8,13 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 from crash_coach_interfaces.msg import EpisodeState, FaultEvent
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
 
 from crash_coach_bringup.ros.client import GraphClient
 from crash_coach_common.contract import UserError
-from crash_coach_pkg.coach.coach import Planner
+from crash_coach_common.ros.qos import EVENTS, EVERY_EPISODE
 from crash_coach_pkg.effects import EffectKind, EffectRow
+from crash_coach_pkg.plan import Planner
 from crash_coach_pkg.schedule import Schedule, World
 from policy_pkg.play.evaluate import EpisodeResult
 from sim_pkg.trajectory import CourseHash
@@ -55,15 +55,8 @@ class Collector:
         node = client.node
         self._reset = node.create_client(Trigger, "sim/reset")
         self._subscriptions = (
-            node.create_subscription(
-                EpisodeState,
-                "sim/episode",
-                self._on_state,
-                QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL),
-            ),
-            node.create_subscription(
-                FaultEvent, "coach/events", self._on_event, QoSProfile(depth=1000)
-            ),
+            node.create_subscription(EpisodeState, "sim/episode", self._on_state, EVERY_EPISODE),
+            node.create_subscription(FaultEvent, "coach/events", self._on_event, EVENTS),
         )
         client.greet("sim", START_S, "the sim to start")
         client.greet("gate", START_S, "the gate to start")

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from crash_coach_interfaces.msg import EpisodeState, FaultEvent
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 
 from crash_coach_bringup.ros.client import GraphClient, graph_client
+from crash_coach_common.ros.qos import EVENTS, EVERY_EPISODE
 from crash_coach_console.episodes import Costs, EpisodeBook, Played
 from crash_coach_console.ros.convert import event_kind
 
@@ -28,9 +28,8 @@ class Episodes:
         self._heard = 0  # messages
         sub = client.node.create_subscription
         # Latched: the first episode may begin before this node is known to the sim.
-        latched = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        sub(EpisodeState, "sim/boundary", self._on_boundary, latched)
-        sub(FaultEvent, "coach/events", self._on_event, QoSProfile(depth=1000), raw=True)
+        sub(EpisodeState, "sim/boundary", self._on_boundary, EVERY_EPISODE)
+        sub(FaultEvent, "coach/events", self._on_event, EVENTS, raw=True)
 
     def told(self, wait_s: float = LISTEN_S) -> Iterator[Played]:
         """Listens for so long; gives what is settled."""

@@ -21,12 +21,14 @@ from crash_coach_bringup.ros.graph import (
 )
 from crash_coach_bringup.ros.supervisor import Supervisor
 from crash_coach_common.contract import UserError
-from crash_coach_pkg.coach.coach import Coach, Planner
-from crash_coach_pkg.coach.config import CoachConfig, TeamSpec
+from crash_coach_pkg.coach.coach import Coach
+from crash_coach_pkg.coach.config import CoachConfig
 from crash_coach_pkg.coach.fault_scenario import ScenarioPlanner, load_fault_scenario
 from crash_coach_pkg.faults import unmet_needs
 from crash_coach_pkg.faults.action_tools import ACTION_OFFERS
 from crash_coach_pkg.faults.base import Need
+from crash_coach_pkg.plan import Planner
+from crash_coach_pkg.team import TeamSpec
 from policy_pkg.play.conditions import Condition
 from policy_pkg.play.evaluate import Evaluation
 from policy_pkg.team_name import scripted_name

@@ -15,9 +15,10 @@ from crash_coach_bringup.ros.parameter_file import ParameterFile
 from crash_coach_bringup.ros.probe import find_executable
 from crash_coach_common.contract import UserError
 from crash_coach_common.executable import command
-from crash_coach_pkg.coach.config import CoachConfig, FaultConfig, TeamSpec
+from crash_coach_pkg.coach.config import CoachConfig, FaultConfig
 from crash_coach_pkg.coach.fault_scenario import load_fault_scenario
 from crash_coach_pkg.faults import check_parameters, fault_mode, is_observation_mode
+from crash_coach_pkg.team import TeamSpec
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.team_name import scripted_name
 from sim_pkg.env import make_env

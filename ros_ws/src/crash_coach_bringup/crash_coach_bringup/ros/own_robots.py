@@ -17,7 +17,7 @@ from crash_coach_bringup.ros.parameter_file import ParameterFile
 from crash_coach_bringup.ros.supervisor import Event, Supervisor, watch
 from crash_coach_bringup.ros.up import stop_signals
 from crash_coach_common.contract import UserError
-from crash_coach_pkg.coach.config import check_robots
+from crash_coach_pkg.team import check_robots
 
 LISTEN_S = 0.02
 GATE = "gate"

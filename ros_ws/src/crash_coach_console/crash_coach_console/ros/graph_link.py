@@ -21,16 +21,17 @@ from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from std_srvs.srv import SetBool, Trigger
+
+from crash_coach_common.ros.qos import ARENA, EVENTS, PLAN
 
 SPIN_S = 0.02
 ANSWER_S = 10.0
 """Longest wait for the answer of a service."""
 
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+NEWEST_OR_LOST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 SERVICES = {
     "set": (SetParametersAtomically, "coach/set_parameters_atomically"),
     "clear_all": (Trigger, "coach/clear_all"),
@@ -110,7 +111,10 @@ class GraphLink:
             self._node.destroy_subscription(reader)
         self._odometry = [
             self._node.create_subscription(
-                Odometry, f"{robot}/odom", partial(self._listener.on_odometry, robot), NEWEST
+                Odometry,
+                f"{robot}/odom",
+                partial(self._listener.on_odometry, robot),
+                NEWEST_OR_LOST,
             )
             for robot in robots
         ]
@@ -200,13 +204,13 @@ class GraphLink:
         return node
 
     def _subscribe(self, node: Node) -> None:
-        hear, many = self._listener, QoSProfile(depth=1000)
+        hear = self._listener
         sub = node.create_subscription
-        sub(Arena, "sim/arena", hear.on_arena, LATCHED)
-        sub(ArenaState, "sim/arena_state", hear.on_state, NEWEST)
+        sub(Arena, "sim/arena", hear.on_arena, ARENA)
+        sub(ArenaState, "sim/arena_state", hear.on_state, NEWEST_OR_LOST)
         # Volatile: what ended before this node came says nothing about who was crashed in it.
         sub(EpisodeState, "sim/boundary", hear.on_boundary, QoSProfile(depth=100))
-        sub(FaultEvent, "coach/events", hear.on_event, many)
-        sub(CrashPlan, "coach/plan", hear.on_plan, LATCHED)
-        sub(CrashPlan, "coach/plan_in_force", hear.on_plan_in_force, LATCHED)
+        sub(FaultEvent, "coach/events", hear.on_event, EVENTS)
+        sub(CrashPlan, "coach/plan", hear.on_plan, PLAN)
+        sub(CrashPlan, "coach/plan_in_force", hear.on_plan_in_force, PLAN)
         sub(DiagnosticArray, "diagnostics", hear.on_diagnostics, QoSProfile(depth=10))

@@ -8,9 +8,9 @@ from crash_coach_bringup.cli.options import Layout, Via
 from crash_coach_bringup.cli.output import CliError
 from crash_coach_common.contract import EnvSpec
 from crash_coach_common.strict_yaml import ConfigError
-from crash_coach_pkg.coach.config import TeamSpec
 from crash_coach_pkg.coach.fault_scenario import FaultScenario, ScenarioPlanner
 from crash_coach_pkg.faults.action_tools import ACTION_OFFERS
+from crash_coach_pkg.team import TeamSpec
 from policy_pkg.play.conditions import Planned, crash_free
 from policy_pkg.play.evaluate import Evaluation, Scripted, evaluate, evaluation_seed
 from policy_pkg.play.target import Target

@@ -1,0 +1,60 @@
+"""The suite clears away what killed nodes leave in shared memory, and nothing else."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from shared_memory import FOLDER, kill_group, remove_left_behind
+
+NODE = """
+import sys, rclpy
+rclpy.init()
+node = rclpy.create_node("left_behind")
+print("up", flush=True)
+sys.stdin.read()
+"""
+SEGMENT = re.compile(rf"{FOLDER}/(fastrtps_(?:port\d+|[0-9a-f]{{16}}))$", re.MULTILINE)
+
+
+def make_old(names: set[str]) -> None:
+    for name in names:
+        os.utime(FOLDER / name, (0, 0))
+
+
+@pytest.mark.skipif(not FOLDER.is_dir(), reason=f"no {FOLDER} here")
+def test_a_killed_nodes_segments_go_and_a_living_ones_stay(ros_env: dict[str, str]) -> None:
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", NODE], stdin=pipe, stdout=pipe, env=ros_env) as it:
+        try:
+            assert it.stdout is not None
+            assert it.stdout.readline() == b"up\n"
+            mapped = set(SEGMENT.findall(Path(f"/proc/{it.pid}/maps").read_text()))
+            own = {name for name in mapped if "port" not in name}
+            assert own
+            make_old(mapped)
+            assert not mapped & set(remove_left_behind())
+        finally:
+            it.kill()
+    assert own <= {path.name for path in FOLDER.iterdir()}
+    make_old(own)
+    assert own <= set(remove_left_behind())
+    assert not own & {path.name for path in FOLDER.iterdir()}
+
+
+@pytest.mark.skipif(not FOLDER.is_dir(), reason=f"no {FOLDER} here")
+def test_a_group_that_is_killed_leaves_nothing(ros_env: dict[str, str]) -> None:
+    pipe = subprocess.PIPE
+    with subprocess.Popen(
+        [sys.executable, "-c", NODE], stdin=pipe, stdout=pipe, env=ros_env, start_new_session=True
+    ) as it:
+        assert it.stdout is not None
+        assert it.stdout.readline() == b"up\n"
+        mapped = set(SEGMENT.findall(Path(f"/proc/{it.pid}/maps").read_text()))
+        kill_group(it)
+    assert {name for name in mapped if "port" not in name}
+    assert not mapped & {path.name for path in FOLDER.iterdir()}
