@@ -108,7 +108,7 @@ def test_colcon_test_finds_tests(tmp_path: Path) -> None:
         [
             "colcon", "--log-base", str(tmp_path / "log"), "test", "--packages-select",
             "crash_coach_common", "--test-result-base", str(tmp_path / "results"),
-            "--pytest-args", " -k", "import_law",
+            "--pytest-args", " -k", "team_cdr",
         ],
         cwd=ROOT / "ros_ws", capture_output=True, text=True, timeout=100, check=False,
     )  # fmt: skip
