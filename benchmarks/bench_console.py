@@ -96,7 +96,8 @@ def running(
     """A graph of untrained robots: its domain, a client, its processes and dt_s."""
     spec = make_env(scenario, 1).spec
     checkpoint = folder / f"{spec.n_robots}" / "step_0"
-    write_untrained(checkpoint, spec, seed=0)
+    if not checkpoint.exists():
+        write_untrained(checkpoint, spec, seed=0)
     up = UpOptions(scenario, checkpoint, layout="team", **options)
     domain = stack.enter_context(reserve_domain())
     supervisor = stack.enter_context(

@@ -148,7 +148,7 @@ def test_ctrl_c_ends_everything_without_a_trace(
 @pytest.mark.parametrize(
     ("layout", "mode", "processes"),
     [
-        pytest.param("team", "lockstep", 4, marks=SOAK),
+        pytest.param("team", "lockstep", 3, marks=SOAK),
         ("nodes", "realtime", 5),
         ("single", "lockstep", 1),
     ],

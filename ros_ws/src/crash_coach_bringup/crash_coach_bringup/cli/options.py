@@ -59,7 +59,10 @@ ViaOption = Annotated[
 
 LayoutOption = Annotated[
     Layout,
-    typer.Option(help="With --via ros: a process per node, one for the team, or a single process."),
+    typer.Option(
+        help="With --via ros: a process per node; one for the policies and one for gate and sim; "
+        "or one for all."
+    ),
 ]
 
 

@@ -31,6 +31,8 @@ Value = bool | int | float | str | Sequence[str] | Sequence[float] | Sequence[in
 # Where all that counts is what a lock-step graph plays, no fault has to end because a loaded
 # machine lets the coach stand still, and everybody with it. The longest lease that a coach takes.
 PATIENT_LEASE_S = 60.0
+# Layout ``team``: what the gate lets pass reaches the sim without a change of processes.
+TOGETHER = ("gate", "sim")
 LOST_STEPS = 3  # without a command, as the sim's own default
 
 
@@ -47,8 +49,8 @@ def nobody_yet() -> CoachConfig:
 class UpOptions:
     """A graph: which scenario, which policies, how many processes.
 
-    ``layout``: ``nodes`` has a policy process per robot, ``team`` one for all policies,
-    ``single`` one process for everything. ``coach`` holds the coach's settings at start, which
+    ``layout``: ``nodes`` has a process per node, ``team`` one for all policies and one for gate and
+    sim, ``single`` one for everything. ``coach`` holds the coach's settings at start, which
     the file ``fault_scenario`` overrules; ``sim`` further parameters of the sim.
     ``relay_observations``: observations pass through the gate, so that faults of them can be
     injected later; where the coach starts with such faults, they do anyway. ``gate`` false leaves
@@ -300,9 +302,15 @@ def placed(
 def graph_processes(options: UpOptions, team: TeamSpec) -> list[Process]:
     """The processes of the layout. Raises GraphError where an executable is not installed."""
     nodes = graph_nodes(options, team)
+    together: tuple[str, ...] = ()
     if options.layout == "single":
-        return [single_process(nodes)]
-    return [node_process(node) for node in nodes]
+        together = tuple(node.name for node in nodes)
+    elif options.layout == "team" and options.gate:
+        together = TOGETHER
+    apart = [node_process(node) for node in nodes if node.name not in together]
+    composed = [node for node in nodes if node.name in together]
+    name = "graph" if options.layout == "single" else "sim"
+    return [*apart, composed_process(name, composed)] if composed else apart
 
 
 def node_process(node: Node) -> Process:
@@ -314,11 +322,11 @@ def node_process(node: Node) -> Process:
     return Process(node.name, (str(executable), *node.arguments()))
 
 
-def single_process(nodes: Sequence[Node]) -> Process:
-    """All nodes in one process: parameters carry their node's name."""
-    arguments: list[str] = []
+def composed_process(name: str, nodes: Sequence[Node]) -> Process:
+    """``nodes`` in one process: parameters carry their node's name."""
+    arguments = [node.name for node in nodes]
     for node in nodes:
         start = namespace_rule(node.namespace)
         arguments += ros_arguments(start, f"{node.name}:", node.parameters)
     arguments += ros_arguments([], "", {}, nodes[0].common())
-    return Process("graph", (*command("crash_coach_bringup.ros.single"), *arguments))
+    return Process(name, (*command("crash_coach_bringup.ros.composed"), *arguments))

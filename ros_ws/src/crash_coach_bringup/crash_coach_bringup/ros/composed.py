@@ -1,30 +1,39 @@
-"""The whole graph in one process, on one executor: ``python -m crash_coach_bringup.ros.single``.
+"""Several nodes of the graph in one process, on one executor:
+``python -m crash_coach_bringup.ros.composed NODE ... --ros-args ...``.
 
-Parameters of a node are given as ``-p <node>:<name>:=<value>``; graph.single_process builds the
+Parameters of a node are given as ``-p <node>:<name>:=<value>``; graph.composed_process builds the
 command line. Only the coach's parameter services run in a thread of their own, as they always do.
 """
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import re
 import sys
+from functools import partial
 from typing import Any
 
 from crash_coach_common.contract import UserError
-from crash_coach_common.ros.run_node import run, serving
-from crash_coach_pkg.ros import coach_node, gate_node
-from policy_pkg.ros.team_node import TeamNode
-from sim_pkg.ros.sim_node import SimNode
+from crash_coach_common.ros.run_node import Serving, run, serving
+
+# Loaded where they run: a process of gate and sim needs no policies.
+_STARTED = {"gate": "crash_coach_pkg.ros.gate_node", "coach": "crash_coach_pkg.ros.coach_node"}
+_NODES = {
+    "team": ("policy_pkg.ros.team_node", "TeamNode"),
+    "sim": ("sim_pkg.ros.sim_node", "SimNode"),
+}
 
 _OF_NODE = re.compile(r"(?P<node>\w+):(?P<name>[\w./]+):=(?P<value>.*)", re.DOTALL)
 
 
 def main() -> int:
     """The exit code: 0 after the last episode or a signal, 1 after one line of error."""
-    sys.argv[1:] = in_namespace(sys.argv[1:])
-    return run(_run, "graph")
+    begin = sys.argv.index("--ros-args")
+    names = sys.argv[1:begin]
+    sys.argv[1:] = in_namespace(sys.argv[begin:])
+    return run(partial(_run, names), "graph" if "team" in names else "sim")
 
 
 def in_namespace(arguments: list[str]) -> list[str]:
@@ -50,14 +59,13 @@ def in_namespace(arguments: list[str]) -> list[str]:
     return [*kept, "--ros-args", "--params-file", f"/proc/self/fd/{memory}", "--"]
 
 
-def _run(received: list[int]) -> None:
+def _run(names: list[str], received: list[int]) -> None:
     with serving() as served:
-        served.start(gate_node.start)
-        served.start(coach_node.start)
-        team, sim = served.add(TeamNode()), served.add(SimNode())
+        nodes = {name: _made(served, name) for name in names}
+        sim, team = nodes["sim"], nodes.get("team")
 
         def done() -> object:
-            if team.failure is not None:
+            if team is not None and team.failure is not None:
                 raise team.failure
             return received or sim.done
 
@@ -65,6 +73,13 @@ def _run(received: list[int]) -> None:
         if sim.failure is not None:
             raise UserError(sim.failure)
         sim.finish()
+
+
+def _made(served: Serving, name: str) -> Any:
+    if name in _STARTED:
+        return served.start(importlib.import_module(_STARTED[name]).start)
+    module, node = _NODES[name]
+    return served.add(getattr(importlib.import_module(module), node)())
 
 
 if __name__ == "__main__":
