@@ -31,15 +31,16 @@ Row = dict[str, Any]
 
 
 def random_episode(sizes: Sizes, rng: np.random.Generator, steps: int) -> Episode:
-    """Random content; the last step terminates."""
+    """Random content, of available actions; the last step terminates."""
     n, actions = sizes.n_robots, sizes.n_actions
     available = rng.random((steps + 1, n, actions)) < 0.7
     available[..., 0] = True
+    wanted = np.where(available[:-1], rng.random((steps, n, actions)), -1.0)
     return Episode(
         obs=rng.standard_normal((steps + 1, n, sizes.obs_size), dtype=np.float32),
         state=rng.standard_normal((steps + 1, sizes.state_size), dtype=np.float32),
         available=available,
-        actions=rng.integers(0, actions, (steps, n), dtype=np.int32),
+        actions=wanted.argmax(axis=-1).astype(np.int32),
         reward=rng.standard_normal(steps, dtype=np.float32),
         faults=np.zeros((steps, n), np.uint8),
         terminated=True,

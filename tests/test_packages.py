@@ -97,6 +97,7 @@ def test_colcon_test_runs_every_room() -> None:
     left = {str(p.relative_to(tests)) for p in tests.rglob("test_*.py") if p not in covered}
     # Of the checkout, not of a package.
     assert {name for name in left if not name.startswith("documents/")} == {
+        "test_benchmarks.py",
         "test_packages.py",
         "test_setup.py",
     }
