@@ -100,6 +100,9 @@ def _table(rows: Sequence[tuple[float, ...]], columns: int) -> Float64Array:
 
 
 def _free(held: Addresses, bodies: Addresses, shapes: Addresses, joints: Addresses) -> None:
-    """What a World held, when it is no longer referenced."""
-    for arena in range(len(held)):
+    """What a World held, when it is no longer referenced.
+
+    One in which nothing was placed calls no compiled code: a signal may have come while it loaded.
+    """
+    for arena in np.flatnonzero(held).tolist():
         spaces.take_down(arena, held, bodies, shapes, joints)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import selectors
+import shutil
 import signal
 import subprocess
 import time
@@ -36,8 +37,15 @@ class Ended:
     def describe(self) -> str:
         code = self.exit_code
         how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-        said = f"; it said:\n{self.tail}" if self.tail else "; it said nothing"
+        said = f"; it said:\n{self.tail}" if self.tail else f"; {self._silent()}"
         return f"{self.name} died ({how}, log {self.log}){said}"
+
+    def _silent(self) -> str:
+        """Why there are no last words."""
+        folder = self.log.parent
+        if folder.is_dir() and shutil.disk_usage(folder).free == 0:
+            return f"No space left on device for what it said: {folder}"
+        return "it said nothing"
 
 
 @dataclass(frozen=True)
