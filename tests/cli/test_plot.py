@@ -24,7 +24,15 @@ from crash_coach_bringup.cli.curves import (
     load_run,
 )
 from crash_coach_bringup.cli.output import CliError
-from crash_coach_bringup.cli.verbs.plot import TITLES, draw, legend, note, plot, targets
+from crash_coach_bringup.cli.verbs.plot import (
+    TITLES,
+    draw,
+    legend,
+    note,
+    plot,
+    targets,
+    wide_enough,
+)
 from crash_coach_common.contract import UserError
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.offline.config import OfflineConfig
@@ -318,3 +326,18 @@ def test_other_verbs_do_not_load_matplotlib() -> None:
         "sys.exit(any(name.split('.')[0] == 'matplotlib' for name in sys.modules))"
     )
     assert subprocess.run([sys.executable, "-c", code], timeout=250).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("limits", "least", "expected"),
+    [
+        ((-0.05, 0.05), 0.0, (-0.0015, 0.05)),  # a crash rate of 0 throughout
+        ((9.9999, 10.0001), 9.9999, (9.5, 10.5)),
+        ((-110.0, -60.0), -110.0, (-110.0, -60.0)),
+        ((-0.2, 4.2), 0.0, (-0.126, 4.2)),
+    ],
+)
+def test_flat_curves_get_a_quiet_axis_and_rates_none_below_zero(
+    limits: tuple[float, float], least: float, expected: tuple[float, float]
+) -> None:
+    assert wide_enough(limits, least) == pytest.approx(expected)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -113,18 +114,24 @@ def draw_panel(ax: Any, key: str, groups: Sequence[Group], curves: Sequence[Curv
         if not group.finished:
             ax.plot(x[-1:], y[-1:], "o", color=colour, markerfacecolor="white", zorder=4)
     if key not in PROBABILITIES and drawn:
-        ax.set_ylim(*wide_enough(ax.get_ylim()))
+        means = np.concatenate([curve.mean for curve in drawn])
+        least = float(np.min(means[np.isfinite(means)], initial=math.inf))
+        ax.set_ylim(*wide_enough(ax.get_ylim(), least))
     # In the title, where no curve can lie beneath it.
     absent = f"\nnot measured: {', '.join(missing)}" if missing else ""
     ax.set_title(TITLES[key] + absent, fontsize=11, color=INK)
 
 
-def wide_enough(limits: tuple[float, float]) -> tuple[float, float]:
-    """The limits of an axis, wider where a flat curve's last digits would fill it."""
+def wide_enough(limits: tuple[float, float], least: float) -> tuple[float, float]:
+    """The limits of an axis, wider where a flat curve's last digits would fill it.
+
+    Where the ``least`` value is not negative the axis hardly is: a rate cannot be.
+    """
     low, high = limits
     middle = (low + high) / 2
     half = max((high - low) / 2, 0.05, 0.05 * abs(middle))
-    return middle - half, middle + half
+    low, high = middle - half, middle + half
+    return (max(low, -0.03 * high) if least >= 0 else low), high
 
 
 def legend(group: Group) -> str:
