@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,15 +41,21 @@ FILE = """
 
 
 def offers(client: GraphClient, topic: str, node: str) -> list[Any]:
-    """The profiles of a node's publishers on a topic."""
-    found = client.node.get_publishers_info_by_topic(topic)
-    return [info.qos_profile for info in found if info.node_name == node]
+    """The profiles of a node's publishers on a topic; waits for its name, which comes last."""
+    return _profiles(client, partial(client.node.get_publishers_info_by_topic, topic), node)
 
 
 def requests(client: GraphClient, topic: str, node: str) -> list[Any]:
     """The profiles of its subscriptions."""
-    found = client.node.get_subscriptions_info_by_topic(topic)
-    return [info.qos_profile for info in found if info.node_name == node]
+    return _profiles(client, partial(client.node.get_subscriptions_info_by_topic, topic), node)
+
+
+def _profiles(client: GraphClient, ends: Callable[[], list[Any]], node: str) -> list[Any]:
+    def named() -> bool:
+        return any(end.node_name == node for end in ends())
+
+    client.until(named, WAIT_S, f"an end of {node}")
+    return [end.qos_profile for end in ends() if end.node_name == node]
 
 
 def test_in_a_whole_team(ros_env: dict[str, str], tmp_path: Path) -> None:
