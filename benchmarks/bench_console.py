@@ -24,7 +24,7 @@ import yaml
 from crash_coach_interfaces.msg import FaultEvent
 from websockets.sync.client import connect
 
-from benchmarks.bench_ros import START_S, WARM_UP_S, WINDOW_S, refuse_dead, sample
+from benchmarks.bench_ros import START_S, WARM_UP_S, WINDOW_S, refuse_dead, sample, untrained
 from crash_coach_bringup.ros.client import graph_client
 from crash_coach_bringup.ros.domain import reserve_domain
 from crash_coach_bringup.ros.graph import (
@@ -34,7 +34,6 @@ from crash_coach_bringup.ros.graph import (
     graph_processes,
 )
 from crash_coach_bringup.ros.supervisor import Supervisor
-from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 
 PAIRS = 4
@@ -95,10 +94,7 @@ def running(
 ) -> tuple[int, Any, Supervisor, float]:
     """A graph of untrained robots: its domain, a client, its processes and dt_s."""
     spec = make_env(scenario, 1).spec
-    checkpoint = folder / f"{spec.n_robots}" / "step_0"
-    if not checkpoint.exists():
-        write_untrained(checkpoint, spec, seed=0)
-    up = UpOptions(scenario, checkpoint, layout="team", **options)
+    up = UpOptions(scenario, untrained(folder, spec), layout="team", **options)
     domain = stack.enter_context(reserve_domain())
     supervisor = stack.enter_context(
         Supervisor(

@@ -27,6 +27,7 @@ from crash_coach_bringup.ros.graph import (
     graph_processes,
 )
 from crash_coach_bringup.ros.supervisor import Supervisor
+from crash_coach_common.contract import EnvSpec
 from crash_coach_pkg.team import TeamSpec
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
@@ -117,14 +118,19 @@ def sample(client: GraphClient, dt_s: float) -> tuple[float, float]:
     return seen[-1]
 
 
+def untrained(folder: Path, spec: EnvSpec) -> Path:
+    """A checkpoint of the team of so many robots, written once."""
+    checkpoint = folder / f"{spec.n_robots}" / "step_0"
+    if not checkpoint.exists():
+        write_untrained(checkpoint, spec, seed=0)
+    return checkpoint
+
+
 def lockstep_steps_per_s(folder: Path, robots: int, layout: Layout, gate: bool) -> float:
     """Control steps per second of a graph that nobody listens to."""
     scenario = SCENARIOS[robots]
     spec = make_env(scenario, 1).spec
-    checkpoint = folder / scenario / "step_0"
-    if not checkpoint.exists():
-        write_untrained(checkpoint, spec, seed=0)
-    options = UpOptions(scenario, checkpoint, layout=layout, gate=gate)
+    options = UpOptions(scenario, untrained(folder, spec), layout=layout, gate=gate)
     with (
         reserve_domain() as domain,
         Supervisor(

@@ -23,7 +23,7 @@ def kill_group(child: subprocess.Popen[Any]) -> None:
     """SIGKILL to ``child``'s process group, and what it so left; no-op where it has ended."""
     if child.poll() is not None:
         return
-    mapped = {name for pid in _group(child.pid) for name in _mapped(pid)}
+    mapped = {name for pid in _group(child.pid) for name in mapped_by(pid)}
     os.killpg(child.pid, signal.SIGKILL)
     child.wait(timeout=_GONE_S)
     for name in mapped:
@@ -52,7 +52,8 @@ def _group_of(pid: int) -> int | None:
         return None
 
 
-def _mapped(pid: int) -> set[str]:
+def mapped_by(pid: int) -> set[str]:
+    """The segments and ports that a process has open; none where it is gone."""
     try:
         maps = Path(f"/proc/{pid}/maps").read_text()
     except (FileNotFoundError, ProcessLookupError):

@@ -10,12 +10,11 @@ import tempfile
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from crash_coach_common.contract import UserError
-from policy_pkg.train.blocks import Block
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.progress import ProgressReport
 from policy_pkg.train.run import Clock, train
@@ -146,8 +145,6 @@ class _Meter:
     cpu_clock: Clock
     tell: Tell
     started_s: float | None = None
-    block_s: list[float] = field(default_factory=list)
-    blocks_before: int = 0
 
     def __post_init__(self) -> None:
         self.stopwatch = Stopwatch(self.clock, self.cpu_clock)
@@ -167,23 +164,11 @@ class _Meter:
             (session.replay, REPLAY, ("add", "sample")),
             (session.learner, LEARNER, ("update",)),
             (session.coach, COACH, ("plan", "finish", "record_block")),
+            (session, EVALUATION, ("test",)),
         ):
             for method in methods:
                 watch(owner, method, part)
-        self._watch_blocks(session)
         self._watch_loop(session)
-
-    def _watch_blocks(self, session: TrainSession) -> None:
-        inner = session.test
-
-        def test() -> Block:
-            begin_s = self.clock()
-            block = inner()
-            self.block_s.append(self.clock() - begin_s)
-            return block
-
-        session.test = test  # type: ignore[method-assign]
-        self.stopwatch.watch(session, "test", EVALUATION)
 
     def _watch_loop(self, session: TrainSession) -> None:
         inner = session.advance
@@ -206,7 +191,6 @@ class _Meter:
     def _start(self) -> None:
         done = self._session.counters
         self._before = (done.env_steps, done.episodes, self._session.learner.updates)
-        self.blocks_before = len(self.block_s)
         self.stopwatch.taken()
         self.started_s = self.clock()
 
@@ -230,10 +214,7 @@ class _Meter:
             )
         steps, episodes, updates = (a - b for a, b in zip(now, self._before, strict=True))
         seconds, cpu_seconds, calls = self.stopwatch.taken()
-        blocks = len(self.block_s) - self.blocks_before
-        if blocks == 0:
-            self._session.test()
-        block_s = self.block_s[self.blocks_before :]
+        blocks = calls[EVALUATION]
         return Profile(
             seconds=seconds,
             cpu_seconds=cpu_seconds,
@@ -243,8 +224,13 @@ class _Meter:
             episodes=episodes,
             gradient_steps=updates,
             blocks=blocks,
-            block_s=sum(block_s) / len(block_s),
+            block_s=seconds[EVALUATION] / blocks if blocks else self._extra_block_s(),
         )
+
+    def _extra_block_s(self) -> float:
+        begin_s = self.clock()
+        self._session.test()
+        return self.clock() - begin_s
 
 
 def _timer_s(clock: Clock, cpu_clock: Clock) -> float:

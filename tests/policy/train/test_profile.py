@@ -109,8 +109,7 @@ def test_every_seam_is_hit(whole: tuple[Profile, Path, list[str]]) -> None:
     assert 0 < result.env_steps < 1200
     assert result.calls["physics"] >= result.calls["rollout"] == result.env_steps / 4
     assert result.calls[EVALUATION] == result.blocks == 4
-    # Two clocks around the same thing: a busy machine comes between them.
-    assert result.blocks * result.block_s == pytest.approx(result.seconds[EVALUATION], rel=0.5)
+    assert result.blocks * result.block_s == pytest.approx(result.seconds[EVALUATION], rel=0.05)
     assert 0 < result.timers_s < result.cpu_s
     assert told
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
-from shared_memory import FOLDER, kill_group, remove_left_behind
+from shared_memory import FOLDER, kill_group, mapped_by, remove_left_behind
 
 NODE = """
 import sys, rclpy
@@ -18,7 +16,6 @@ node = rclpy.create_node("left_behind")
 print("up", flush=True)
 sys.stdin.read()
 """
-SEGMENT = re.compile(rf"{FOLDER}/(fastrtps_(?:port\d+|[0-9a-f]{{16}}))$", re.MULTILINE)
 
 
 def make_old(names: set[str]) -> None:
@@ -33,7 +30,7 @@ def test_a_killed_nodes_segments_go_and_a_living_ones_stay(ros_env: dict[str, st
         try:
             assert it.stdout is not None
             assert it.stdout.readline() == b"up\n"
-            mapped = set(SEGMENT.findall(Path(f"/proc/{it.pid}/maps").read_text()))
+            mapped = mapped_by(it.pid)
             own = {name for name in mapped if "port" not in name}
             assert own
             make_old(mapped)
@@ -54,7 +51,7 @@ def test_a_group_that_is_killed_leaves_nothing(ros_env: dict[str, str]) -> None:
     ) as it:
         assert it.stdout is not None
         assert it.stdout.readline() == b"up\n"
-        mapped = set(SEGMENT.findall(Path(f"/proc/{it.pid}/maps").read_text()))
+        mapped = mapped_by(it.pid)
         kill_group(it)
     assert {name for name in mapped if "port" not in name}
     assert not mapped & {path.name for path in FOLDER.iterdir()}

@@ -302,15 +302,13 @@ def placed(
 def graph_processes(options: UpOptions, team: TeamSpec) -> list[Process]:
     """The processes of the layout. Raises GraphError where an executable is not installed."""
     nodes = graph_nodes(options, team)
-    together: tuple[str, ...] = ()
     if options.layout == "single":
-        together = tuple(node.name for node in nodes)
-    elif options.layout == "team" and options.gate:
-        together = TOGETHER
-    apart = [node_process(node) for node in nodes if node.name not in together]
-    composed = [node for node in nodes if node.name in together]
-    name = "graph" if options.layout == "single" else "sim"
-    return [*apart, composed_process(name, composed)] if composed else apart
+        return [composed_process("graph", nodes)]
+    together = TOGETHER if options.layout == "team" and options.gate else ()
+    processes = [node_process(node) for node in nodes if node.name not in together]
+    if together:
+        processes.append(composed_process("sim", [n for n in nodes if n.name in together]))
+    return processes
 
 
 def node_process(node: Node) -> Process:
