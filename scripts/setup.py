@@ -18,6 +18,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -30,6 +31,7 @@ KERNELS = ROOT / "policy_pkg/policy_pkg/learner/native"
 KERNEL_FLAGS = {"avx2": ["-mavx2", "-mfma"], "avx512": ["-mavx512f", "-mavx2", "-mfma"]}
 KERNEL_OPTIONS = ["-std=c++17", "-O3", "-ffp-contract=off", "-fPIC", "-shared"]
 LOCK = ROOT / "requirements.lock"
+LOOPS = ROOT / "scripts" / "compile_loops.py"
 
 UV_VERSION = "0.13.9"
 OLDEST, NEWEST = (3, 11), (3, 14)
@@ -214,6 +216,16 @@ def build_kernels() -> None:
         os.replace(fresh, folder / f"learner_{name}.so")
 
 
+def simulator_sources() -> list[Path]:
+    return [LOOPS, *sorted((ROOT / "sim_pkg" / "sim_pkg").rglob("*.py"))]
+
+
+def compile_loops() -> None:
+    path = [ROOT / "sim_pkg", WORKSPACE / "src" / "crash_coach_common"]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, path))}
+    run([str(PYTHON), str(LOOPS)], VENV / "log" / "loops.log", env=env)
+
+
 def workspace_sources() -> list[str | Path]:
     """What the build depends on; Python modules do not count, they are linked, not copied."""
     sources: list[str | Path] = []
@@ -268,7 +280,13 @@ def main() -> int:
                 kernels = fingerprint([base, *sources, *KERNEL_OPTIONS, str(KERNEL_FLAGS)])
                 stage("kernel", "learner's kernels", kernels, build_kernels)
             build = fingerprint([packages, *workspace_sources()])
-            stage("workspace", "ROS workspace", build, lambda: build_workspace(ros))
+            loops = fingerprint([packages, *simulator_sources()])
+            with ThreadPoolExecutor() as beside:
+                compiled = beside.submit(
+                    stage, "loops", "simulator's compiled functions", loops, compile_loops
+                )
+                stage("workspace", "ROS workspace", build, lambda: build_workspace(ros))
+                compiled.result()
     except SetupError as error:
         print(f"setup: {error}", file=sys.stderr)
         return 1

@@ -72,8 +72,11 @@ def process(
     try:
         yield child
     finally:
+        ended = child.poll()
         kill_group(child)
-        child.communicate(timeout=WAIT_S)
+        _, said = child.communicate(timeout=WAIT_S)
+        if ended:  # pytest shows it where the test failed
+            print(f"{name} ended by itself, {ended}:\n{said}")
 
 
 def remapped(rules: Sequence[str]) -> list[str]:

@@ -13,6 +13,7 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from crash_coach_common.contract import UserError
+from crash_coach_common.ros.entities import destroy_subscription
 from crash_coach_pkg.gate.health import Decided
 from crash_coach_pkg.gate.plan_book import PlanBook
 from crash_coach_pkg.gate.relay_gate import Outputs, Relay, Sent
@@ -227,7 +228,7 @@ class RelayGate:
             )
             if wanted != self._asked[robot]:
                 self._asked[robot] = wanted
-                self._base.destroy_subscription(subscription)
+                destroy_subscription(self._base, subscription)
                 self._inputs[robot] = self._subscribe(robot)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -56,9 +57,10 @@ def test_a_coach_that_another_overrules_names_it(ros_env: dict[str, str], looker
         stack.enter_context(process(ros_env, "coach", rules=("__node:=coach_b",), **own))
         names = "2 nodes publish on /coach/plan: /coach, /coach_b"
         assert looker.until("gate: robot_1", names).level != DiagnosticStatus.OK
-        answer = ""
-        for number in range(10):
-            answer = answer or setter.set(victims=[ROBOTS[number % 2]])
+        answer, number, end = "", 0, time.monotonic() + WAIT_S
+        while not answer and time.monotonic() < end:  # until the gate has a plan of the other
+            number += 1
+            answer = setter.set(victims=[ROBOTS[number % 2]])
         assert answer == f"no gate armed the plan within 2 s; {names}"
 
 

@@ -25,6 +25,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from std_srvs.srv import SetBool, Trigger
 
+from crash_coach_common.ros.entities import destroy_subscription
 from crash_coach_common.ros.qos import ARENA, EVENTS, PLAN
 
 SPIN_S = 0.02
@@ -108,7 +109,7 @@ class GraphLink:
         """On the link's thread: hears the odometry of these robots, and of nobody else."""
         assert self._node is not None  # made before the thread serves
         for reader in self._odometry:
-            self._node.destroy_subscription(reader)
+            destroy_subscription(self._node, reader)
         self._odometry = [
             self._node.create_subscription(
                 Odometry,
