@@ -12,6 +12,7 @@ from shared_memory import remove_left_behind
 
 from crash_coach_bringup.ros import discovery
 from crash_coach_bringup.ros.domain import reserve_domain
+from crash_coach_common.caches import FOLDERS
 
 # Where the suite runs in the background of a shell, Ctrl-C is ignored, by all that it starts too.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -25,6 +26,18 @@ settings.load_profile("here")
 def pytest_sessionstart(session: pytest.Session) -> None:
     if not hasattr(session.config, "workerinput"):  # once, before pytest-xdist's workers
         remove_left_behind()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def environment() -> Iterator[None]:
+    """What a test leaves behind here reaches all tests after it, and what they start.
+
+    Of numba's folder, for one: every process compiled the simulator anew.
+    """
+    names = (*FOLDERS, "HOME", "PYTHONPATH", "ROS_DOMAIN_ID", "TMPDIR", "XDG_CACHE_HOME")
+    before = {name: os.environ.get(name) for name in names}
+    yield
+    assert {name: os.environ.get(name) for name in names} == before
 
 
 @pytest.fixture

@@ -87,7 +87,8 @@ def test_a_signal_is_one_line_at_any_moment(team: str, number: int, after_s: flo
 def nowhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """A home and sources that cannot be written to; only the temporary folder can."""
     for name in (*caches.FOLDERS, "XDG_CACHE_HOME", "XDG_CONFIG_HOME", "ROS_HOME"):
-        monkeypatch.delenv(name, raising=False)
+        monkeypatch.setenv(name, "")  # else it would not take back what is set where nothing was
+        monkeypatch.delenv(name)
     (tmp_path / "file").touch()
     monkeypatch.setenv("HOME", str(tmp_path / "file/home"))
     monkeypatch.setenv("TMPDIR", str(tmp_path))

@@ -199,6 +199,8 @@ def test_a_recording_plays_pauses_and_goes_to_any_step(over: Page) -> None:
 
 def test_a_run_is_crashed_in_the_same_episode_by_a_double_click(over: Page) -> None:
     run = over.locator(".stage").nth(1)
+    run.locator(".step").click()  # it plays from the start on, and would play on from step 4
+    over.wait_for_function("() => !crashCoach.stages[1].timeline.playing")
     run.get_by_label("Step of the episode").fill("4")
     over.wait_for_function("() => crashCoach.stages[1].motion.newest.step === 4")
     over.wait_for_function("() => !crashCoach.stages[1].dirty")

@@ -63,7 +63,7 @@ def fleets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleets]:
     folder = tmp_path_factory.mktemp("fleets")
     checkpoint = folder / "step_0"
     write_untrained(checkpoint, make_env("buttons", 1).spec, seed=1)
-    pace = {"pace_hz": 100.0}
+    pace = {"pace_hz": 50.0}
     options = UpOptions("buttons", checkpoint, layout="team", namespace=OURS, sim=pace)
     processes = graph_processes(options, check_team(options))
     with pytest.MonkeyPatch.context() as patch, ExitStack() as stack:

@@ -34,6 +34,7 @@ from sim_pkg.ros.sim_lock import only_sim
 
 SOAK = pytest.mark.soak
 TOLD_WITHIN_S = 2.0
+CALM = {"pace_hz": 50.0}  # leaves the processor to other tests
 UP = """
 import json, sys
 from pathlib import Path
@@ -112,7 +113,7 @@ def await_episode() -> None:
 def test_a_node_that_is_killed_is_told_and_ends_the_graph(
     checkpoint: Path, tmp_path: Path, ros_env: dict[str, str], victim: str
 ) -> None:
-    with up(checkpoint, tmp_path, ros_env) as running:
+    with up(checkpoint, tmp_path, ros_env, sim=CALM) as running:
         running.started(5)
         assert set(running.pids) == {"sim", "coach", "gate", "policy_robot_1", "policy_robot_2"}
         if victim == "coach":
@@ -132,7 +133,7 @@ def test_a_node_that_is_killed_is_told_and_ends_the_graph(
 def test_ctrl_c_ends_everything_without_a_trace(
     checkpoint: Path, tmp_path: Path, ros_env: dict[str, str]
 ) -> None:
-    with up(checkpoint, tmp_path, ros_env) as running:
+    with up(checkpoint, tmp_path, ros_env, sim=CALM) as running:
         running.started(5)
         await_episode()
         running.child.send_signal(signal.SIGINT)
