@@ -30,7 +30,7 @@ check: setup environments ## ruff, mypy, the architecture's laws, the documents'
 	$(IN_ENV) $(PYTEST) $(SIDE_BY_SIDE) -n 2 $(CHECKED)
 
 test: setup mlflow environments ## the test suite (but for what `make check` runs), 6 to 7 minutes on 2 cores
-	$(IN_ENV) $(PYTEST) $(SIDE_BY_SIDE) -n 4 $(CHECKED:%=--ignore=%)
+	$(IN_ENV) $(PYTEST) $(SIDE_BY_SIDE) -n 3 $(CHECKED:%=--ignore=%)
 
 demo: setup ## train two teams, run them as ROS graphs, crash robots, read off the cost
 	$(IN_ENV) crash-coach demo $(DEMO_OPTIONS)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -24,10 +24,12 @@ SETTINGS = (
 
 
 @pytest.fixture(scope="module", autouse=True)
-def importable() -> None:
+def importable() -> Iterator[None]:
     """Also in the processes that the verbs start."""
-    sys.path.insert(0, str(SUPPORT))
-    os.environ["PYTHONPATH"] = f"{SUPPORT}:{os.environ.get('PYTHONPATH', '')}"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(SUPPORT)
+        patch.setenv("PYTHONPATH", str(SUPPORT), prepend=os.pathsep)
+        yield
 
 
 @pytest.fixture(scope="module")

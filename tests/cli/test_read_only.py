@@ -74,6 +74,7 @@ def test_a_team_is_evaluated(place: Path) -> None:
     assert json.loads((place / "out.json").read_text())
 
 
+@pytest.mark.soak  # three processes compile without a cache
 def test_a_graph_runs(place: Path) -> None:
     done = typed(place, "up", "buttons", "--policy", "step_0", "--episodes", "1")
     assert done.returncode == 0, done.stdout + done.stderr

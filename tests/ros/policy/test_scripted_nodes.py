@@ -11,7 +11,7 @@ from policy_pkg.play.conditions import exactly
 from policy_pkg.play.evaluate import Scripted, evaluate
 
 
-@pytest.mark.parametrize("layout", ["nodes", "single"])
+@pytest.mark.parametrize("layout", ["single", pytest.param("nodes", marks=pytest.mark.soak)])
 def test_the_same_episodes(tmp_path: Path, layout: str) -> None:
     condition = exactly(1, "random")
     core = evaluate(Scripted("random"), "buttons", condition, 2, 3)

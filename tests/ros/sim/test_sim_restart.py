@@ -61,6 +61,7 @@ def test_the_same_episodes_again(ros_env: Env, driver: Driver, tmp_path: Path) -
     assert len({*first, *later}) == 3
 
 
+@pytest.mark.soak
 def test_in_real_time_the_team_drives_on(ros_env: Env, driver: Driver, tmp_path: Path) -> None:
     got: list[Action] = []
     for robot in ROBOTS:
