@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
+import importlib.util
 import inspect
 from collections.abc import Callable
 from functools import cache
@@ -10,6 +12,29 @@ from pathlib import Path
 from typing import Any
 
 from numba import njit
+
+
+def _spare_scipy() -> None:
+    """Lets numba look whether SciPy is there without loading its linear algebra.
+
+    That took 0.2 s of every process's start, and nothing here is compiled with it. What somebody
+    else compiles with it loads it then, as numba does in any case.
+    """
+    linalg: Any = importlib.import_module("numba.np.linalg")
+    ensure = linalg.ensure_blas
+
+    def is_there() -> None:
+        if importlib.util.find_spec("scipy") is None:
+            raise ImportError("scipy 0.16+ is required for linear algebra")
+
+    linalg.ensure_blas = is_there
+    try:
+        importlib.import_module("numba.np.arraymath")
+    finally:
+        linalg.ensure_blas = ensure
+
+
+_spare_scipy()
 
 helper: Callable[[Callable[..., Any]], Any] = njit(  # type: ignore[call-overload]
     cache=True, forceinline=True, _nrt=False

@@ -49,3 +49,21 @@ def test_code_is_kept_until_a_file_of_its_package_changes(tmp_path: Path) -> Non
     assert run(HELPER.format(added=1)) == ["2.0", "1"]
     changed = HELPER.format(added=2).replace("ADDED = 1", "ADDED = 5")
     assert run(changed) == ["7.0", "0"]  # of one change alone it would be 6 or 3
+
+
+def test_others_compile_with_scipy_as_before() -> None:
+    """It is not loaded with the simulator, only for who uses it."""
+    code = (
+        "import sys, numpy as np\n"
+        "import sim_pkg.compiled\n"
+        "from numba import njit\n"
+        "print('scipy.linalg' in sys.modules)\n"
+        "try:\n"
+        "    import scipy\n"
+        "except ImportError:\n"
+        "    print('absent')\n"
+        "else:\n"
+        "    print(njit(lambda a, b: np.dot(a, b))(np.ones(3), np.ones(3)))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout.split() in (["False", "3.0"], ["False", "absent"])
