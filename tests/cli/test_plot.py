@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -341,3 +342,15 @@ def test_flat_curves_get_a_quiet_axis_and_rates_none_below_zero(
     limits: tuple[float, float], least: float, expected: tuple[float, float]
 ) -> None:
     assert wide_enough(limits, least) == pytest.approx(expected)
+
+
+def test_what_versions_wrote_differently_is_one_method(tmp_path: Path) -> None:
+    """A key that a later version added with its default, and what is logged beside."""
+    share = Path(__file__).parents[2] / "results" / "recipe" / "share"
+    runs = [tmp_path / f"qmix-s{seed}" for seed in (0, 10)]
+    for run in runs:
+        shutil.copytree(share / run.name, run)
+    keys = [json.loads((run / "run.json").read_text())["config"]["learner"].keys() for run in runs]
+    assert [("device" in each) for each in keys] == [False, True]
+    (group,) = group_runs([load_run(run) for run in runs])
+    assert group.label == "qmix"

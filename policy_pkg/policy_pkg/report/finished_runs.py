@@ -46,10 +46,9 @@ from policy_pkg.train.run_dir import (
 from sim_pkg.env import ScenarioLike
 from sim_pkg.scenario_source import ScenarioSource, short_name
 
-NO_SETTING = {
-    *("scenario", "seed", *LENGTHS),
-    *("loggers", "checkpoint_interval_steps", "checkpoint_replay"),
-}
+KEPT_BESIDE = {"loggers", "checkpoint_interval_steps", "checkpoint_replay"}
+"""What a run keeps, which changes nothing of what it does."""
+NO_SETTING = {"scenario", "seed", *LENGTHS, *KEPT_BESIDE}
 
 
 @dataclass(frozen=True)
@@ -157,16 +156,24 @@ def _content(run: Run) -> str | None:
     return run.source.sha256 if isinstance(run.source, ScenarioSource) else None
 
 
-def _read(given: Path) -> Run:
-    path, best = split_best(given)
-    content = read_run(path)["config"]
+def todays_config(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration of ``path``'s run with today's keys, whatever version wrote it.
+
+    Raises:
+        RunError: it is none.
+    """
     model = TrainConfig if "total_steps" in content else OfflineConfig
     try:
-        config = model.model_validate(content).model_dump(mode="json")
+        return model.model_validate(content).model_dump(mode="json")
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
         raise RunError(f"{path / RUN}: config.{place}: {first['msg']}") from error
+
+
+def _read(given: Path) -> Run:
+    path, best = split_best(given)
+    config = todays_config(path, read_run(path)["config"])
     checkpoint = find_checkpoint(given)
     manifest = read_manifest(checkpoint)
     if AGENT not in manifest.files:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from crash_coach_bringup.cli.output import CliError
-from policy_pkg.report.finished_runs import read_text
+from policy_pkg.report.finished_runs import KEPT_BESIDE, read_text, todays_config
 from policy_pkg.train.metrics import crashed_robot
 from policy_pkg.train.run_dir import METRICS, RUN, read_run, seedless_name
 
@@ -134,7 +134,11 @@ def load_run(path: Path) -> Run:
     return Run(
         path,
         kind,
-        {key: value for key, value in config.items() if key != "seed"},
+        {
+            key: value
+            for key, value in todays_config(path, config).items()
+            if key not in {"seed", *KEPT_BESIDE}
+        },
         "" if data is None else data["sha256"],
         config["seed"],
         np.array([row[kind.steps] for row in rows]),
