@@ -20,7 +20,7 @@ help: ## this list
 setup: ## .venv, pinned packages, built ROS workspace
 	@PYTHON="$(PYTHON)" $(if $(PYTHON),$(PYTHON),python3) scripts/setup.py
 
-check: setup environments ## ruff, mypy, the architecture's laws, the documents' commands
+check: setup environments ## ruff, mypy, the laws of architecture and packages, the documents' commands
 	$(IN_ENV) ruff format --check $(CODE) && ruff check $(CODE)
 	$(IN_ENV) mypy sim_pkg/sim_pkg policy_pkg/policy_pkg crash_coach_pkg/crash_coach_pkg \
 	    ros_ws/src/crash_coach_common/crash_coach_common \

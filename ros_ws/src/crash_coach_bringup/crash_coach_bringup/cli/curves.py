@@ -202,8 +202,8 @@ def _each_crashed(content: Mapping[str, Any]) -> float | None:
 
 
 def group_runs(runs: Sequence[Run]) -> list[Group]:
-    """Runs of the same config but for the seed, and of the same recordings where they have any,
-    become one group; groups in order of appearance.
+    """Runs of the same config but for the seed and what is kept beside, and of the same recordings
+    where they have any, become one group; groups in order of appearance.
 
     Raises:
         CliError: two runs have the same config and seed: together they would pass for two seeds;
