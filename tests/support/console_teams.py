@@ -83,14 +83,22 @@ class Teams:
     domains: tuple[int, int]
     clients: tuple[GraphClient, GraphClient]
     crashed: dict[tuple[int, int], list[int]]  # of the first team, by (episode, step)
+    lengths: dict[int, int]  # of its episodes that are over, in control steps
     one: str  # address of the console on the first team
     both: str
 
     def crashed_at(self, episode: int, step: int) -> list[int]:
-        """Who of the first team was crashed in a control step, once it is over."""
-        key = (episode, step)
-        self.clients[0].until(lambda: key in self.crashed, WAIT_S, f"episode, step {key}")
-        return self.crashed[key]
+        """Who of the first team was crashed in a control step, once it is over.
+
+        A plan that is armed behind an episode's last step is so from the next one's first on.
+        """
+
+        def key() -> tuple[int, int]:
+            ended = step >= self.lengths.get(episode, step + 1)
+            return (episode + 1, 0) if ended else (episode, step)
+
+        self.clients[0].until(lambda: key() in self.crashed, WAIT_S, f"step {step} of {episode}")
+        return self.crashed[key()]
 
     def newest(self) -> list[int]:
         """Who of the first team was crashed in the last control step."""
@@ -142,16 +150,19 @@ def teams(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Teams]:
             clients.append(stack.enter_context(graph_client("looker", domain)))
         first, second = domains
         crashed: dict[tuple[int, int], list[int]] = {}
+        lengths: dict[int, int] = {}
 
         def look(state: EpisodeState) -> None:
             crashed[state.episode, state.step - 1] = list(state.crashed)
+            if state.terminated or state.truncated:
+                lengths[state.episode] = state.step
 
         clients[0].node.create_subscription(EpisodeState, "/sim/episode", look, 1000)
         environment = {**os.environ, **graph_environment(first)}
         one = stack.enter_context(console(environment))
         asked = ("--domain", str(first), str(second))
         both = stack.enter_context(console(environment, *asked))
-        yield Teams((first, second), (clients[0], clients[1]), crashed, one, both)
+        yield Teams((first, second), (clients[0], clients[1]), crashed, lengths, one, both)
 
 
 class Asker:
