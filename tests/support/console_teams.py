@@ -158,6 +158,8 @@ def teams(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Teams]:
                 lengths[state.episode] = state.step
 
         clients[0].node.create_subscription(EpisodeState, "/sim/episode", look, 1000)
+        # Before its first episode a team has no step that a fault could be armed at.
+        clients[0].until(lambda: bool(crashed), WAIT_S, "an episode")
         environment = {**os.environ, **graph_environment(first)}
         one = stack.enter_context(console(environment))
         asked = ("--domain", str(first), str(second))

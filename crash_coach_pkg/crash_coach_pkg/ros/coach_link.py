@@ -25,7 +25,7 @@ from crash_coach_pkg.ros.convert import (
     played_from_bytes,
 )
 
-ARM_TIMEOUT_S = 2.0
+ARM_TIMEOUT_S = 5.0  # a busy machine may stand still for two
 HEARTBEATS_PER_LEASE = 3
 # How long the first plan waits for a gate to be discovered and to say what is in force. A gate
 # always says something, so that only a coach without one waits for so long.
@@ -68,7 +68,9 @@ class CoachLink(QosNode):
         self.changed = threading.Condition()
         self._robots = robots
         self._check = check
+        self.armed_since = ""  # of the plan that was armed last
         self._armed_revision = 0
+        self._awaited = 0  # the revision whose answer is waited for, or was last
         self._refused: dict[int, str] = {}  # reasons, by revision
         self._due_s = 0.0
         self._started_s = time.monotonic()
@@ -99,6 +101,7 @@ class CoachLink(QosNode):
     def await_gate(self, plan: CrashPlan) -> str:
         """Waits for ARMED, with ``changed`` held; returns what is wrong, or nothing."""
         revision = plan.revision
+        self._awaited = revision
         answered = self.changed.wait_for(
             lambda: self._armed_revision >= revision or revision in self._refused,
             timeout=ARM_TIMEOUT_S,
@@ -185,7 +188,9 @@ class CoachLink(QosNode):
                 return
             if message.kind == FaultEvent.ARMED:
                 self._armed_revision = message.revision
-                self._refused.clear()
+                self.armed_since = f"armed at step {message.step} of episode {message.episode}"
+                # Not one that is yet to be read: the next episode's plan may be armed by then.
+                self._refused = {r: why for r, why in self._refused.items() if r >= self._awaited}
                 self.control.armed(message.revision, message.step)
                 self.changed.notify_all()
             elif message.kind == FaultEvent.REFUSED:

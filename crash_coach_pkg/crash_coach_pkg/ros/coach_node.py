@@ -69,7 +69,8 @@ class CoachNode(QosNode):
 
     def __init__(self, context: Context | None = None) -> None:
         super().__init__("coach", context=context, start_parameter_services=False)
-        self._parameter_services = CheckedParameterService(self)
+        self._parameter_services = CheckedParameterService(self, lambda: self._said)
+        self._said = ""  # of the last change: since when it is armed
         robots = robot_names(self)
         self._unconfirmed = ""  # why no gate confirmed the last change that was made all the same
         start = self._declare(START_SPECS)
@@ -125,6 +126,7 @@ class CoachNode(QosNode):
             self._served.result()
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
+        self._said = ""
         changed = {p.name: _from_ros(p.value) for p in parameters if p.name in self._values}
         values = {**self._values, **changed}
         try:
@@ -145,6 +147,10 @@ class CoachNode(QosNode):
             if answer and not disabling:
                 self.link.publish(self.link.control.restore(before))
                 return SetParametersResult(successful=False, reason=answer)
+            if plan is not None and not answer:
+                self._said = self.link.armed_since
+            elif now and self.link.control.plan is None:
+                self._said = "no episode has begun: it counts from the first one on"
         self._values, self._unconfirmed = values, answer
         return SetParametersResult(successful=True)
 

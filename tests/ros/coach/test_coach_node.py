@@ -29,6 +29,15 @@ def plan_of(g: Graph | Team, episode: int) -> CrashPlan:
     return new_plan(played, lambda plan: plan.episode == episode, f"plan of episode {episode}")
 
 
+def told(g: Graph, **values: object) -> str:
+    """What the coach says to a change that it makes."""
+    asked = g.operator.begin(**values)
+    g.team.until(lambda: g.operator.poll(asked), "the coach's answer")
+    result = asked.result().result
+    assert result.successful
+    return str(result.reason)
+
+
 def victims(plan: CrashPlan) -> list[str]:
     return [fault.robot for fault in plan.faults]
 
@@ -142,7 +151,7 @@ def test_without_a_gate_an_injection_is_refused_and_undone(ros_env: dict[str, st
         assert not setter.set(apply_at="next_step")
         t.announce(0, 0)
         plan_of(t, 0)
-        assert "no gate armed the plan within 2 s" in setter.set(victims=["robot_1"])
+        assert "no gate armed the plan within 5 s" in setter.set(victims=["robot_1"])
         assert setter.get("victims") == [["none"]]
         t.until(lambda: any(plan.faults for plan in t.plans), "the injection")
         newest = new_plan(t, lambda plan: not plan.faults, "the plan without the fault")
@@ -154,11 +163,16 @@ def test_without_a_gate_an_injection_is_refused_and_undone(ros_env: dict[str, st
         assert setter.get("enabled") == [False]
 
 
-def test_an_injection_lasts_as_many_steps_as_asked(ros_env: dict[str, str]) -> None:
+def test_an_injection_lasts_as_many_steps_as_asked_and_is_told_when_it_begins(
+    ros_env: dict[str, str],
+) -> None:
     with graph(ros_env) as g:
+        first = "no episode has begun: it counts from the first one on"
+        assert told(g, victims=["none"], apply_at="next_step") == first
         for step in range(5):
             g.team.step(0, step)
-        assert not g.operator.set(victims=["robot_2"], apply_at="next_step", duration_steps=3)
+        begins = told(g, victims=["robot_2"], duration_steps=3)
+        assert begins == "armed at step 5 of episode 0"
         faulted = [g.team.step(0, step)[1].faulted for step in range(5, 12)]
         assert faulted == [True] * 3 + [False] * 4
         # The same again is another injection.

@@ -168,7 +168,8 @@ def test_a_wrong_fault_scenario_ends_it_with_one_line(ros_env: dict[str, str]) -
 
 def test_without_a_sim_one_endless_episode_starts_at_once(ros_env: dict[str, str]) -> None:
     with graph(ros_env, lockstep=False, follow_sim=False) as g:
-        g.team.until(lambda: bool(g.team.armed()), "a plan")
+        # Not until it is armed: that may have been told before this node listened.
+        g.team.until(lambda: bool(g.team.plans), "a plan")
         assert (g.team.plans[-1].episode, len(g.team.plans[-1].faults)) == (0, 0)
         g.team.step(0, 0)
         assert not g.operator.set(victims=["robot_3"], duration_steps=2)  # though next_episode

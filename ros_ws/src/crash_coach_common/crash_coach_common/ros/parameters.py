@@ -6,7 +6,7 @@ without a name, and do not say which name is not declared. Here all three are re
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Literal, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
@@ -107,7 +107,14 @@ class CheckedParameterService(ParameterService):
     Several parameters in one call of set_parameters, such as `ros2 param load` makes, are set
     together where that is possible, so that their order does not matter; otherwise one by one, each
     with its own result. What is read-only is left as it is, and does not keep the others from it.
+
+    said: what came of the last change, empty: nothing to tell; it becomes the result's reason,
+    which rclpy leaves empty where a change succeeds. `ros2 param set` prints it.
     """
+
+    def __init__(self, node: Node, said: Callable[[], str] = str) -> None:
+        super().__init__(node)
+        self._said = said
 
     def _set_parameters_callback(
         self, request: SetParameters.Request, response: SetParameters.Response
@@ -119,11 +126,17 @@ class CheckedParameterService(ParameterService):
             if refusal is not None:
                 response.results.append(refusal)
             elif together and not self._read_only(parameter.name):
-                response.results.append(SetParametersResult(successful=True))
+                response.results.append(self._with_words(SetParametersResult(successful=True)))
             else:
                 one = SetParameters.Request(parameters=[parameter])
                 super()._set_parameters_callback(one, response)
+                self._with_words(response.results[-1])
         return response
+
+    def _with_words(self, result: SetParametersResult) -> SetParametersResult:
+        if result.successful:
+            result.reason = self._said()
+        return result
 
     def _set_together(self, parameters: list[ParameterMessage]) -> bool:
         """Whether all could be set at once; otherwise nothing was."""
@@ -143,8 +156,10 @@ class CheckedParameterService(ParameterService):
     ) -> SetParametersAtomically.Response:
         refusal = self._refusal(request.parameters)
         if refusal is None:
-            return super()._set_parameters_atomically_callback(request, response)
-        response.result = refusal
+            super()._set_parameters_atomically_callback(request, response)
+            self._with_words(response.result)
+        else:
+            response.result = refusal
         return response
 
     def _refusal(self, parameters: Iterable[ParameterMessage]) -> SetParametersResult | None:

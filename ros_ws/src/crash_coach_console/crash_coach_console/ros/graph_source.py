@@ -48,7 +48,6 @@ SHOW_S = 0.2
 """How often a team's state is posted at most."""
 DRAW_S = 1 / 30
 SILENT_S = 3.5
-ARMED_S = 1.0
 
 
 class GraphSource:
@@ -83,7 +82,6 @@ class GraphSource:
         self._arena = False  # whether our sim has told its own
         self._fleet = Fleet(())
         self._status: Mapping[str, Any] = {}
-        self._armed: tuple[int, int] | None = None
         self._paused = False
         self._busy = asyncio.Lock()
 
@@ -143,8 +141,6 @@ class GraphSource:
             self._team.active(message.robot, message.mode, message.episode)
         elif kind in (FaultEvent.CLEARED, FaultEvent.EXPIRED):
             self._team.cleared(message.robot)
-        elif kind == FaultEvent.ARMED:
-            self._armed = (message.episode, message.step)
         self.board.log({"at_s": time.time(), **convert.event_value(message)})
 
     def on_plan(self, message: CrashPlan) -> None:
@@ -273,7 +269,8 @@ class GraphSource:
         self._link.run(lambda: self._show(answer))
         return read_values(answer)
 
-    async def _set(self, values: Mapping[str, Value]) -> None:
+    async def _set(self, values: Mapping[str, Value]) -> str:
+        """Returns the coach's words: since when the change is armed, or nothing."""
         request = SetParametersAtomically.Request(
             parameters=[convert.parameter_message(name, value) for name, value in values.items()]
         )
@@ -281,6 +278,7 @@ class GraphSource:
         self._asked_s = -1e9  # show what holds now
         if not result.successful:
             raise OperatorError(f"refused: {result.reason}")
+        return str(result.reason)
 
     async def _inject(self, asked: Inject) -> str:
         wanted = injection(
@@ -292,22 +290,11 @@ class GraphSource:
             asked.parameters,
         )
         wanted = with_others(wanted, await self._settings())
-        self._armed = None
-        await self._set(wanted)
+        since = await self._set(wanted)
         victims = wanted["victims"]
         assert isinstance(victims, Sequence)
         told = describe([str(v) for v in victims], asked.mode, asked.apply_at, asked.parameters)
-        return told + (await self._when_armed() if asked.apply_at == "next_step" else "")
-
-    async def _when_armed(self) -> str:
-        """The gate's answer, which came before the coach's; its event may come a little later."""
-        until_s = time.monotonic() + ARMED_S
-        while self._armed is None and time.monotonic() < until_s:
-            await asyncio.sleep(0.01)
-        if self._armed is None:
-            return ""
-        episode, step = self._armed
-        return f" (armed at step {step} of episode {episode})"
+        return f"{told} ({since})" if since else told
 
     async def _clear(self, robots: Sequence[str]) -> str:
         left = victims_left(robots, await self._settings())
