@@ -7,7 +7,7 @@ IN_ENV := . ./env.sh &&
 PYTEST := PYTHONDONTWRITEBYTECODE= pytest
 SIDE_BY_SIDE := -m "not soak" --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 # Of the checkout, its packages and its documents: `make check` runs these, `make test` all others.
-CHECKED := tests/test_architecture.py tests/test_packages.py tests/test_setup.py tests/documents
+CHECKED := tests/test_architecture.py tests/packages tests/documents
 CODE := sim_pkg policy_pkg crash_coach_pkg ros_ws/src/crash_coach_common ros_ws/src/crash_coach_bringup \
     ros_ws/src/crash_coach_console tests benchmarks scripts examples
 PAGE := ros_ws/src/crash_coach_console/crash_coach_console/web

@@ -67,7 +67,7 @@ def catches_sigterm(pid: int) -> bool:
     return bool(int(mask, 16) >> (signal.SIGTERM - 1) & 1)
 
 
-@pytest.mark.parametrize("after_s", [0.0, 0.5, 3.0])
+@pytest.mark.parametrize("after_s", [0.0, 0.5, pytest.param(3.0, marks=pytest.mark.soak)])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_is_one_line_at_any_moment(team: str, number: int, after_s: float) -> None:
     """From where our first line has run: while libraries are loaded, at work."""

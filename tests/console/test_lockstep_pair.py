@@ -19,6 +19,10 @@ from sim_pkg.env import make_env
 
 SPACE = "fleet_a"
 
+pytestmark = (
+    pytest.mark.soak
+)  # two whole graphs; test_page.py has two teams in every run of the suite
+
 
 class Pair:
     """``ends``: of each team, the last state of each episode, by its number."""

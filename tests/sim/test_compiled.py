@@ -54,10 +54,11 @@ def test_code_is_kept_until_a_file_of_its_package_changes(tmp_path: Path) -> Non
 def test_others_compile_with_scipy_as_before() -> None:
     """It is not loaded with the simulator, only for who uses it."""
     code = (
-        "import sys, numpy as np\n"
+        "import importlib.util, sys, numpy as np\n"
         "import sim_pkg.compiled\n"
         "from numba import njit\n"
-        "print('scipy.linalg' in sys.modules)\n"
+        "print('scipy.linalg' in sys.modules or 'coverage' in sys.modules)\n"
+        "importlib.util.find_spec('coverage')\n"
         "try:\n"
         "    import scipy\n"
         "except ImportError:\n"

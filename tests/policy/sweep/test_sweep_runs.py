@@ -68,6 +68,7 @@ def steps(runs: list[SweepRun], out: Path) -> int:
     return sum(newest_step(out / run.name) for run in runs)
 
 
+@pytest.mark.soak
 @pytest.mark.timeout(300)
 def test_a_killed_sweep_ends_with_the_same_results(tmp_path: Path) -> None:
     adaptive = {"adaptive": TINY["methods"]["adaptive"]}

@@ -119,6 +119,7 @@ def test_every_mode_has_the_same_effects(coverage: Path, tmp_path: Path) -> None
     assert modes_of(got) == set(MODES)
 
 
+@pytest.mark.soak
 def test_every_trigger_has_the_same_effects(coverage: Path, tmp_path: Path) -> None:
     file = write(tmp_path / "triggers.yaml", with_triggers("hazard", "near", "return"))
     got = compare(coverage, file, "team", 2, SCENARIO)

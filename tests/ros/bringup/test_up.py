@@ -150,7 +150,7 @@ def test_ctrl_c_ends_everything_without_a_trace(
     ("layout", "mode", "processes"),
     [
         pytest.param("team", "lockstep", 3, marks=SOAK),
-        ("nodes", "realtime", 5),
+        pytest.param("nodes", "realtime", 5, marks=SOAK),
         ("single", "lockstep", 1),
     ],
 )

@@ -26,7 +26,7 @@ WORDS = (
     *mode_names(), "stay", *ROBOTS, "none", "fixed", "fixed", "adaptive", "curriculum", "ceil",
     "floor", "authors", "next_step", "next_episode", "scout", "hauler", "",
 )  # fmt: skip
-SIZES = [60, pytest.param(5000, marks=pytest.mark.soak)]
+SIZES = [30, pytest.param(5000, marks=pytest.mark.soak)]
 
 
 def settings_of(values: dict[str, ParameterValue]) -> ControlSettings:

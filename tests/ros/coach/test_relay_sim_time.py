@@ -122,7 +122,7 @@ def crash(simulator: Simulator, setter: Operator, **more: object) -> None:
     assert future.result().result.successful, future.result().result.reason
 
 
-@pytest.mark.parametrize("factor", [0.5, 4.0])
+@pytest.mark.parametrize("factor", [0.5, pytest.param(4.0, marks=pytest.mark.soak)])
 def test_a_fault_lasts_its_steps_of_the_simulators_clock(
     ros_env: dict[str, str], factor: float
 ) -> None:

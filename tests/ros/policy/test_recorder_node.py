@@ -160,7 +160,11 @@ def check_bag(bag: Path, expected: dict[int, tuple[Episode, bool]]) -> None:
 
 @pytest.mark.parametrize(
     ("crash", "episodes", "epsilon"),
-    [(RANDOM, 20, 0.0), pytest.param(MUTE, 5, 1.0, marks=pytest.mark.soak), (BLIND, 5, 0.3)],
+    [
+        (RANDOM, 20, 0.0),
+        pytest.param(MUTE, 5, 1.0, marks=pytest.mark.soak),
+        pytest.param(BLIND, 5, 0.3, marks=pytest.mark.soak),
+    ],
     ids=["random", "mute", "blind"],
 )
 def test_a_recording_equals_the_rollout(

@@ -191,6 +191,7 @@ def test_a_gif_has_the_same_times(tmp_path: Path) -> None:
     assert shown_ms / 1000 == pytest.approx(2 + LAST_S, abs=2 / GIF_FPS)
 
 
+@pytest.mark.soak
 def test_the_same_episode_gives_the_same_file(tmp_path: Path) -> None:
     for name in ("a.mp4", "b.mp4", "a.gif", "b.gif", "a.png", "b.png"):
         path = tmp_path / name

@@ -20,7 +20,8 @@ from policy_pkg.learner.config import LearnerConfig
 from policy_pkg.learner.learner import Learner
 from policy_pkg.learner.mixer import make_mixer
 
-PAGE = Path(__file__).parents[3] / "docs/adding_an_algorithm.md"
+TESTS = Path(__file__).parents[1]
+PAGE = TESTS.parent / "docs/adding_an_algorithm.md"
 SIZES = Sizes(n_robots=2, n_actions=3, obs_size=4, state_size=5, episode_limit=6)
 LEARN = """
 import json, sys
@@ -39,8 +40,8 @@ def blocks() -> dict[str, str]:
 
 
 def environment(site: Path) -> dict[str, str]:
-    here = Path(__file__).parent
-    paths = [str(site), str(here), str(here.parents[1] / "support"), os.environ.get("PYTHONPATH")]
+    paths = [str(site), str(TESTS / "policy/learner"), str(TESTS / "support")]
+    paths.append(os.environ.get("PYTHONPATH", ""))
     return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
 
 
