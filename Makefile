@@ -20,7 +20,7 @@ help: ## this list
 setup: ## .venv, pinned packages, built ROS workspace
 	@PYTHON="$(PYTHON)" $(if $(PYTHON),$(PYTHON),python3) scripts/setup.py
 
-check: setup environments ## ruff, mypy, the laws of architecture and packages, the documents' commands
+check: setup mlflow environments ## ruff, mypy, the laws of architecture and packages, the documents' commands
 	$(IN_ENV) ruff format --check $(CODE) && ruff check $(CODE)
 	$(IN_ENV) mypy sim_pkg/sim_pkg policy_pkg/policy_pkg crash_coach_pkg/crash_coach_pkg \
 	    ros_ws/src/crash_coach_common/crash_coach_common \
@@ -29,7 +29,7 @@ check: setup environments ## ruff, mypy, the laws of architecture and packages, 
 	$(IN_ENV) oxlint --quiet --deny-warnings $(PAGE)
 	$(IN_ENV) $(PYTEST) $(SIDE_BY_SIDE) -n 2 $(CHECKED)
 
-test: setup mlflow environments ## the test suite (but for what `make check` runs), 6 to 7 minutes on 2 cores
+test: setup ## the test suite (but for what `make check` runs), about 5 minutes on 2 cores
 	$(IN_ENV) $(PYTEST) $(SIDE_BY_SIDE) -n 3 $(CHECKED:%=--ignore=%)
 
 demo: setup ## train two teams, run them as ROS graphs, crash robots, read off the cost

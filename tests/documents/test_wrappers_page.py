@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -71,3 +72,16 @@ def test_in_a_bare_environment(tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "crash rate" in done.stdout
+
+
+def test_the_programs_on_our_scenarios() -> None:
+    """docs/wrappers.md, its section on our scenarios."""
+    page = (ROOT / "docs/wrappers.md").read_text().split("## Our scenarios for your trainer")[1]
+    said = []
+    for code in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL):
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+        assert done.returncode == 0, done.stderr
+        said.append(done.stdout)
+    assert re.fullmatch(r"(True|False) (True|False) \(\d+, 900, 3\)\n", said[0])
+    assert said[1] == "2 8\n"

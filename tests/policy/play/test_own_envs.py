@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import subprocess
-import sys
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -117,16 +115,3 @@ def test_a_window_where_there_is_a_display(monkeypatch: pytest.MonkeyPatch) -> N
         server.kill()
         server.wait(10)
         os.close(read)
-
-
-def test_the_pages_programs() -> None:
-    """docs/wrappers.md, its section on our scenarios."""
-    page = (ROOT / "docs/wrappers.md").read_text().split("## Our scenarios for your trainer")[1]
-    said = []
-    for code in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL):
-        command = [sys.executable, "-c", code]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=100)
-        assert done.returncode == 0, done.stderr
-        said.append(done.stdout)
-    assert re.fullmatch(r"(True|False) (True|False) \(\d+, 900, 3\)\n", said[0])
-    assert said[1] == "2 8\n"

@@ -19,7 +19,7 @@ from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 
 WAIT_S = 60.0
-PACE_HZ = 100.0
+PACE_HZ = 60.0
 
 
 @dataclass(frozen=True)
