@@ -11,7 +11,7 @@ import pytest
 from in_process import refused, typed
 
 from crash_coach_bringup.cli.main import repeat_options
-from crash_coach_bringup.cli.options import conditions, mode_parameters
+from crash_coach_bringup.cli.options import conditions, mode_parameters, timed
 from crash_coach_bringup.cli.output import CliError, check_json_target, write_json
 from crash_coach_bringup.cli.verbs.train import plan_jobs
 from crash_coach_bringup.ros.probe import find_executable
@@ -131,6 +131,25 @@ def test_wrong_conditions_are_named(
 def test_wrong_modes_and_parameters_are_named(mode: str, given: list[str], message: str) -> None:
     with pytest.raises(CliError, match=message):
         mode_parameters(mode, given)
+
+
+def test_faults_in_some_steps_alone() -> None:
+    asked = conditions(("robot_1", "robot_2"), [0.5], [0, 1], ["robot_2"], "delay", {"steps": 3})
+    late = timed(asked, 5, 0)
+    assert [c.name for c in late] == [
+        "rate 0.5, from step 5 on",
+        "0 crashed",
+        "1 crashed, from step 5 on",
+        "robot_2 delay, from step 5 on",
+    ]
+    assert late[1] == asked[1]
+    short = timed(asked, 5, 2)[3].crash
+    assert (short.start_step, short.duration_steps, short.crash_parameters) == (5, 2, {"steps": 3})
+    assert timed(asked, 5, 2)[3].name == "robot_2 delay, steps 5 to 6"
+    assert timed(asked, 0, 0) == asked
+    for start, duration, option in ((5, 0, "--start 5"), (0, 2, "--duration-steps 2")):
+        with pytest.raises(CliError, match=f"{option}: nobody crashes"):
+            timed(conditions(("robot_1",), [], [], [], "mute", {}), start, duration)
 
 
 def test_parameters_of_a_mode() -> None:

@@ -71,6 +71,25 @@ def named(
     return replace(condition, victim=victims[0] if len(victims) == 1 else "")
 
 
+def within(condition: Condition, start_step: int, duration_steps: int) -> Condition:
+    """The same crashes in these control steps of every episode alone; 0 steps: to its end.
+
+    Crash-free stays what it is.
+    """
+    if condition.crashed == 0 or not (start_step or duration_steps):
+        return condition
+    steps = {"start_step": start_step, "duration_steps": duration_steps}
+    crash = CoachConfig.model_validate({**condition.crash.model_dump(), **steps})
+    return replace(condition, name=f"{condition.name}{when(**steps)}", crash=crash)
+
+
+def when(start_step: int, duration_steps: int) -> str:
+    """', steps 20 to 24', ', from step 20 on'; nothing for whole episodes."""
+    if duration_steps:
+        return f", steps {start_step} to {start_step + duration_steps - 1}"
+    return f", from step {start_step} on" if start_step else ""
+
+
 def _fixed(name: str, who: dict[str, Any], mode: str, parameters: Parameters) -> Condition:
     how = {"strategy": "fixed", "crash_mode": mode, "crash_parameters": dict(parameters)}
     crash = CoachConfig.model_validate({**how, **who})

@@ -9,12 +9,11 @@ import pytest
 
 from crash_coach_common.contract import EnvSpec, UserError
 from crash_coach_common.strict_yaml import ConfigError
-from crash_coach_pkg.coach.config import CoachConfig
 from policy_pkg.checkpoint import CheckpointError, PolicyBundle
 from policy_pkg.episode import Sizes
 from policy_pkg.learner.config import LearnerConfig
 from policy_pkg.learner.learner import Learner
-from policy_pkg.play.conditions import Condition, at_rate, crash_free, exactly, named
+from policy_pkg.play.conditions import Condition, at_rate, crash_free, exactly, named, within
 from policy_pkg.play.evaluate import Evaluation, Scripted, evaluate, evaluation_seed, record
 from policy_pkg.policy import RecurrentPolicy
 from policy_pkg.train.config import TrainConfig
@@ -43,7 +42,7 @@ CONDITIONS = [
     exactly(1, "random"),
     exactly(2),
     named(["robot_2"], "random"),
-    Condition("late", CoachConfig(strategy="fixed", victims=("robot_1",), start_step=3)),
+    within(named(["robot_1"]), 3, 0),
 ]
 
 

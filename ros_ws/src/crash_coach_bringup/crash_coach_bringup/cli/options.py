@@ -12,7 +12,8 @@ import typer
 from crash_coach_bringup.cli.output import CliError
 from crash_coach_common.contract import UserError
 from crash_coach_pkg.faults import check_parameters, fault_mode
-from policy_pkg.play.conditions import Condition, at_rate, crash_free, exactly, named
+from crash_coach_pkg.plan import NEXT_STEP
+from policy_pkg.play.conditions import Condition, at_rate, crash_free, exactly, named, within
 
 MODE = "mute"  # unless told otherwise
 CrashedOption = Annotated[
@@ -31,6 +32,16 @@ NamespaceOption = Annotated[
 ParamOption = Annotated[
     list[str] | None,
     typer.Option(help="NAME=VALUE ...: parameters of the mode, such as steps=3 of delay."),
+]
+
+
+StartOption = Annotated[
+    int,
+    typer.Option(help="First faulted control step of each episode.", min=0, max=NEXT_STEP - 1),
+]
+DurationOption = Annotated[
+    int,
+    typer.Option(help="Control steps; 0: until the episode ends.", min=0, max=NEXT_STEP - 1),
 ]
 
 
@@ -148,6 +159,18 @@ def conditions(
     if each_robot is not None and not any(condition.crashed == 0 for condition in out):
         return [crash_free(), *out]
     return out or [crash_free()]
+
+
+def timed(found: list[Condition], start: int, duration_steps: int) -> list[Condition]:
+    """The same with faults in these steps only.
+
+    Raises:
+        CliError: there is nobody whom that could concern.
+    """
+    for option, steps in (("start", start), ("duration-steps", duration_steps)):
+        if steps and not any(condition.crashed != 0 for condition in found):
+            raise CliError(f"--{option} {steps}: nobody crashes; say who, such as --crashed 1")
+    return [within(condition, start, duration_steps) for condition in found]
 
 
 def _check(

@@ -8,6 +8,7 @@ from typing import Any
 
 from crash_coach_bringup.cli.markdown import table
 from crash_coach_bringup.cli.report.findings import Findings
+from policy_pkg.play.conditions import when
 from policy_pkg.report.coping import Coping
 from policy_pkg.report.paired import LEAST_PAIRS, PairedDifference
 from policy_pkg.report.rows import ALL_MAPS, Improvement, Row, best
@@ -42,6 +43,7 @@ def page(findings: Findings) -> str:
     if about["parameters"]:
         values = ", ".join(f"{name} = {value:g}" for name, value in about["parameters"].items())
         mode += f" ({values})"
+    mode += when(about["start_step"], about["duration_steps"])
     parts = [
         f"Success in % of {about['episodes']} greedy episodes per run and condition (evaluation "
         f"seed {about['seed']}, the same episodes for every run, which no training has played; "

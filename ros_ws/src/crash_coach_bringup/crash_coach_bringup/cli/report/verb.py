@@ -12,10 +12,13 @@ import typer
 from crash_coach_bringup.cli.options import (
     MODE,
     MOST_EPISODES,
+    DurationOption,
     ModeOption,
     ParamOption,
+    StartOption,
     conditions,
     mode_parameters,
+    timed,
 )
 from crash_coach_bringup.cli.output import CliError, console, write_file, write_json, written_first
 from crash_coach_bringup.cli.report.findings import Findings
@@ -129,6 +132,8 @@ def report(
     each_robot: EachRobotOption = None,
     mode: ModeOption = MODE,
     param: ParamOption = None,
+    start: StartOption = 0,
+    duration_steps: DurationOption = 0,
     seed: Annotated[int, typer.Option(help="Of the episodes, the same for every run.", min=0)] = 0,
     against: AgainstOption = None,
     trajectories: TrajectoriesOption = None,
@@ -144,8 +149,11 @@ def report(
     parameters = mode_parameters(mode, param or [])
     runs, waiting = _begun(find_runs(folders))
     _check_methods(against or [], runs)
+    who = crashed, crash_rate, each_robot
     wanted = {
-        run.scenario: asked(arena(run.source)[0], crashed, crash_rate, each_robot, mode, parameters)
+        run.scenario: timed(
+            asked(arena(run.source)[0], *who, mode, parameters), start, duration_steps
+        )
         for run in runs
     }
     exact = any(c.crashed is not None for found in wanted.values() for c in found)
@@ -156,6 +164,8 @@ def report(
         "key": evaluation_seed(seed),
         "mode": mode,
         "parameters": parameters,
+        "start_step": start,
+        "duration_steps": duration_steps,
         "against": against or [],
         "without_checkpoint": [str(path) for path in waiting],
     }

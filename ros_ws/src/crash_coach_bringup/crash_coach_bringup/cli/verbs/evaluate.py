@@ -11,16 +11,19 @@ from crash_coach_bringup.cli.options import (
     MODE,
     MOST_EPISODES,
     CrashedOption,
+    DurationOption,
     EachRobotOption,
     Layout,
     LayoutOption,
     ModeOption,
     ParamOption,
     ProcessesOption,
+    StartOption,
     Via,
     ViaOption,
     conditions,
     mode_parameters,
+    timed,
 )
 from crash_coach_bringup.cli.output import (
     check_json_target,
@@ -85,6 +88,8 @@ def evaluate(
     each_robot: EachRobotOption = False,
     mode: ModeOption = MODE,
     param: ParamOption = None,
+    start: StartOption = 0,
+    duration_steps: DurationOption = 0,
     processes: ProcessesOption = 1,
     via: ViaOption = Via.core,
     layout: LayoutOption = Layout.nodes,
@@ -104,6 +109,7 @@ def evaluate(
     name = target.scenario
     who = crash_rate or [], crashed or [], victims or []
     asked = conditions(target.robots, *who, mode, parameters, each_robot=each_robot)
+    asked = timed(asked, start, duration_steps)
     played = play(target, asked, episodes, evaluation_seed(seed), processes, via, layout)
     results = list(zip(asked, played, strict=True))
     summaries = as_json(results)
@@ -112,6 +118,7 @@ def evaluate(
     result["layout"] = layout.value if via is Via.ros else None
     result |= {"seed": seed, "key": evaluation_seed(seed), "episodes": episodes}
     result |= {"mode": mode, "parameters": parameters}
+    result |= {"start_step": start, "duration_steps": duration_steps}
     result |= {"trajectory_hash": trajectory_hash, "conditions": summaries}
     with written_first(json, result):
         show(f"{team} on {name}: {episodes} episodes each, seed {seed}, via {via}", results)
