@@ -15,7 +15,7 @@ from in_process import refused, typed
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs/export.md"
-TEAM = ROOT / "results/recipe/robust_openblas/robust-s0"
+TEAM = ROOT / "results/recipe/robust/robust-s0"
 
 
 def block(language: str) -> str:

@@ -235,7 +235,7 @@ def test_no_block_is_left_out() -> None:
         ". ./env.sh",
         "ros2 param set /coach enabled true",
         "crash-coach doctor",
-        "crash-coach evaluate results/recipe/robust_openblas/robust-s0 --episodes 4 --each-robot",
+        "crash-coach evaluate results/recipe/robust/robust-s0 --episodes 4 --each-robot",
         f"source {DISTRIBUTION}",
         'ros2 run crash_coach_pkg gate --ros-args -p robots:="[robot_1, robot_2]"',
     ]

@@ -21,7 +21,7 @@ def found(sweep: str) -> list[Coping]:
     return coping([Result(run, [], training_of(run)) for run in runs])
 
 
-@pytest.mark.parametrize("sweep", ["robust", "robust_openblas", "share", "ablation"])
+@pytest.mark.parametrize("sweep", ["robust", "share", "ablation"])
 def test_when_they_cope(sweep: str) -> None:
     """The page has every row that `crash-coach report` makes of the folder, as it makes it."""
     lines = coping_table(found(sweep)).splitlines()

@@ -16,7 +16,7 @@ from policy_pkg.play.conditions import named
 from policy_pkg.play.evaluate import evaluate
 
 ROOT = Path(__file__).resolve().parents[2]
-TEAM = ROOT / "results/recipe/robust_openblas/robust-s0"
+TEAM = ROOT / "results/recipe/robust/robust-s0"
 PAGE = ROOT / "docs/export.md"
 ABSENT = ("torch", "numba", "pymunk", "sim_pkg", "crash_coach_pkg", "onnx")
 

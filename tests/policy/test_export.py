@@ -26,7 +26,7 @@ from sim_pkg.env import make_env
 
 ROOT = Path(__file__).resolve().parents[2]
 TRAINED = {
-    "buttons": ROOT / "results/recipe/robust_openblas/robust-s0",
+    "buttons": ROOT / "results/recipe/robust/robust-s0",
     "3m": ROOT / "results/skirmish/3m-s0",
     "2s3z": ROOT / "results/skirmish/2s3z-s0",
 }
