@@ -168,6 +168,11 @@ class Replay:
         chances: npt.NDArray[np.float64] = (1 - _EVEN_SHARE) * uniform + _EVEN_SHARE * even
         return chances
 
+    def importance(self, batch: Batch) -> npt.NDArray[np.float64]:
+        """(B,) of a batch's episodes 1 / (N p), at most 2: what makes a stratified draw's expected
+        loss that of a uniform draw (one after another without replacement: nearly)."""
+        return 1.0 / (len(self) * self.probabilities()[batch.slots])
+
     def gather(self, slots: npt.NDArray[np.int64]) -> Batch:
         """The packed batch of the given stored episodes (0 <= slot < len); one may come twice."""
         lengths = self._length[slots]

@@ -5,3 +5,4 @@ from __future__ import annotations
 from typing import Literal
 
 Strata = Literal["none", "crashed", "outcome"]
+Weights = Literal["none", "importance"]

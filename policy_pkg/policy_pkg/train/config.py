@@ -24,7 +24,7 @@ from crash_coach_common.strict_yaml import (
 )
 from crash_coach_pkg.coach.config import CoachConfig
 from policy_pkg.learner.config import LearnerConfig
-from policy_pkg.learner.strata import Strata
+from policy_pkg.learner.strata import Strata, Weights
 from policy_pkg.train.loggers import Chosen
 from sim_pkg.foreign.config import EnvRules
 from sim_pkg.scenario_source import NO_RULES, ScenarioSource, read_scenario
@@ -87,6 +87,11 @@ class TrainConfig(RunSettings):
         description="draw half of the episodes evenly over strata: by which robots crashed, or by "
         "outcome (that and success); none: uniformly",
     )
+    replay_weights: Weights = Field(
+        "none",
+        description="importance: an episode counts in the loss by 1 / (N p), p its chance to be "
+        "drawn from N; strata then change how often it is seen, not how much it counts",
+    )
     epsilon_start: float = Field(1.0, ge=0, le=1, description="exploration at the start")
     epsilon_finish: float = Field(0.05, ge=0, le=1, description="exploration after annealing")
     epsilon_anneal_steps: int = Field(
@@ -125,6 +130,15 @@ class TrainConfig(RunSettings):
             raise ValueError(
                 f"batch_episodes {self.batch_episodes} is more than replay_episodes "
                 f"{self.replay_episodes}: learning would never start"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _weights_need_strata(self) -> Self:
+        if self.replay_weights != "none" and self.replay_strata == "none":
+            raise ValueError(
+                f"replay_weights {self.replay_weights} has no effect with replay_strata none: all "
+                "episodes are drawn alike"
             )
         return self
 

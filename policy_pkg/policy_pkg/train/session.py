@@ -104,7 +104,9 @@ class EpisodeSession:
         while done.credit >= 1:
             done.credit -= 1
             batch = self.replay.sample(self.sampling, config.batch_episodes)
-            self.means.add(self.learner.update(batch, episodes=done.episodes))
+            weighted = config.replay_weights == "importance"
+            weights = self.replay.importance(batch) if weighted else None
+            self.means.add(self.learner.update(batch, episodes=done.episodes, weights=weights))
 
     def _close(self, record: BlockRecord, block: Block) -> dict[str, Value]:
         """Closes a block; its line of metrics."""

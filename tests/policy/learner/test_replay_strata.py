@@ -60,6 +60,19 @@ def test_draws_follow_the_probabilities_and_hold_no_episode_twice() -> None:
         assert len(set(replay.sample(rng, 32).slots.tolist())) == 32
 
 
+def test_with_importance_weights_the_expected_loss_is_that_of_a_uniform_draw() -> None:
+    replay, rng = filled("outcome"), np.random.default_rng(3)
+    whole = replay.gather(np.arange(100))
+    weights, chances = replay.importance(whole), replay.probabilities()[whole.slots]
+    assert weights.max() <= 2
+    assert chances * weights == pytest.approx(np.full(100, 0.01))
+    batch = replay.sample(rng, 32)
+    again = replay.importance(replay.gather(batch.slots))  # in the batch's order, longest first
+    np.testing.assert_array_equal(replay.importance(batch), again)
+    uniform = filled("none")
+    assert set(uniform.importance(uniform.sample(rng, 8))) == {1.0}
+
+
 def test_strata_follow_what_is_overwritten_and_a_round_trip() -> None:
     replay, rng = filled("outcome"), np.random.default_rng(2)
     for _ in range(98):  # over everything but the rare ones

@@ -161,6 +161,7 @@ def test_every_setting_of_the_recipe_goes_on_where_it_was(tmp_path: Path) -> Non
         "total_steps": 1600,
         "explore_hold": 6,
         "replay_strata": "outcome",
+        "replay_weights": "importance",
         "test_victim_episodes": 1,
         "learner": {**CONFIG.learner.model_dump(), "td_lambda": 0.8, "optimiser": "adam"},
     }

@@ -87,6 +87,10 @@ def test_overrides_are_yaml_values_and_the_seed_wins() -> None:
         ("seed.x=3", r"--set seed\.x=3: 'seed' is a value, not a section"),
         ("n_envs=[1", r"--set n_envs=\[1: '\[1' is not a YAML value"),
         (
+            "replay_weights=importance",
+            r"with --set replay_weights=importance: replay_weights importance has no effect with",
+        ),
+        (
             "batch_episodes=6000",
             r"with --set batch_episodes=6000: batch_episodes 6000 is more",
         ),
