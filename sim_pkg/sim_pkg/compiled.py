@@ -47,9 +47,7 @@ def _spare_scipy() -> None:
 
 _spare_scipy()
 
-helper: Callable[[Callable[..., Any]], Any] = njit(
-    cache=True, forceinline=True, _nrt=False
-)
+helper: Callable[[Callable[..., Any]], Any] = njit(cache=True, forceinline=True, _nrt=False)
 """For functions that only compiled ones call, and that allocate nothing.
 
 They become part of their caller and do not count references to the arrays they are given, as
