@@ -94,6 +94,12 @@ EachRobotOption = Annotated[
         show_default=False,
     ),
 ]
+OutOption = Annotated[
+    Path, typer.Option(help="Folder for the tables and figures; goes on where it was left.")
+]
+EpisodesOption = Annotated[
+    int, typer.Option(help="Episodes per run and condition.", min=1, max=MOST_EPISODES)
+]
 TrajectoriesOption = Annotated[
     int | None,
     typer.Option(help="SEED: draw the first episode of every method's run with that seed."),
@@ -121,12 +127,8 @@ class Extra:
 
 def report(
     folders: FoldersArgument = None,
-    out: Annotated[
-        Path, typer.Option(help="Folder for the tables and figures; goes on where it was left.")
-    ] = Path("report"),
-    episodes: Annotated[
-        int, typer.Option(help="Episodes per run and condition.", min=1, max=MOST_EPISODES)
-    ] = 128,
+    out: OutOption = Path("report"),
+    episodes: EpisodesOption = 128,
     crashed: CrashedOption = None,
     crash_rate: RateOption = None,
     each_robot: EachRobotOption = None,
@@ -144,16 +146,12 @@ def report(
 
     Runs with equal settings are seeds of one method, which is called what their folders are.
     """
-    if not folders:
-        raise CliError("nothing to report on: name runs or folders of runs")
     parameters = mode_parameters(mode, param or [])
-    runs, waiting = _begun(find_runs(folders))
+    runs, waiting = _begun(folders or [])
     _check_methods(against or [], runs)
-    who = crashed, crash_rate, each_robot
+    who, steps = (crashed, crash_rate, each_robot), (start, duration_steps)
     wanted = {
-        run.scenario: timed(
-            asked(arena(run.source)[0], *who, mode, parameters), start, duration_steps
-        )
+        run.scenario: timed(asked(arena(run.source)[0], *who, mode, parameters), *steps)
         for run in runs
     }
     exact = any(c.crashed is not None for found in wanted.values() for c in found)
@@ -178,8 +176,11 @@ def report(
         raise CliError(f"--out {out}: {error.strerror}: {error.filename}") from error
 
 
-def _begun(paths: Sequence[Path]) -> tuple[list[Run], list[Path]]:
+def _begun(folders: list[Path]) -> tuple[list[Run], list[Path]]:
     """The runs, and those that have no checkpoint yet."""
+    if not folders:
+        raise CliError("nothing to report on: name runs or folders of runs")
+    paths = find_runs(folders)
     waiting = [path for path in paths if not has_begun(path)]
     runs = read_runs(path for path in paths if path not in waiting)
     if not runs:
