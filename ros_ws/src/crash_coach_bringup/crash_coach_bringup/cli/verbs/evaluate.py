@@ -39,6 +39,13 @@ from policy_pkg.play.evaluate import Evaluation, evaluation_seed
 from policy_pkg.play.target import HELP, load_target
 from sim_pkg.trajectory import combine
 
+RateOption = Annotated[
+    list[float] | None,
+    typer.Option(help="R ...: each robot crashes with probability R, drawn each episode."),
+]
+VictimsOption = Annotated[
+    list[str] | None, typer.Option(help="ROBOT ...: all of these robots, in every episode.")
+]
 COST = "cost: how much lower success is than crash-free, in points (95 % interval)."
 
 
@@ -77,14 +84,9 @@ def evaluate(
     episodes: Annotated[
         int, typer.Option(help="Episodes per condition.", min=1, max=MOST_EPISODES)
     ] = 128,
-    crash_rate: Annotated[
-        list[float] | None,
-        typer.Option(help="R ...: each robot crashes with probability R, drawn each episode."),
-    ] = None,
+    crash_rate: RateOption = None,
     crashed: CrashedOption = None,
-    victims: Annotated[
-        list[str] | None, typer.Option(help="ROBOT ...: all of these robots, in every episode.")
-    ] = None,
+    victims: VictimsOption = None,
     each_robot: EachRobotOption = False,
     mode: ModeOption = MODE,
     param: ParamOption = None,
