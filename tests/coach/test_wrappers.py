@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from crash_coach_pkg.team import TeamSpec
 from crash_coach_pkg.wrappers import CrashWrapper, MultiAgentView
 from sim_pkg.pettingzoo import ParallelArena
 
-ROOT = Path(__file__).resolve().parents[2]
 HALF = {"strategy": "fixed", "crash_rate": 0.5, "resample": False}
 
 

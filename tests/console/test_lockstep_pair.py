@@ -19,9 +19,8 @@ from sim_pkg.env import make_env
 
 SPACE = "fleet_a"
 
-pytestmark = (
-    pytest.mark.soak
-)  # two whole graphs; test_page.py has two teams in every run of the suite
+# Two whole graphs; test_page.py has two teams in every run of the suite.
+pytestmark = pytest.mark.soak
 
 
 class Pair:

@@ -71,7 +71,7 @@ class CoachLink(QosNode):
         self.armed_since = ""  # of the plan that was armed last
         self._armed_revision = 0
         self._awaited = 0  # the revision whose answer is waited for, or was last
-        self._refused: dict[int, str] = {}  # reasons, by revision
+        self._refusal: str | None = None  # the gate's, of that revision
         self._due_s = 0.0
         self._started_s = time.monotonic()
         self._settled = False  # whether it is known what a coach before this one left in force
@@ -101,16 +101,16 @@ class CoachLink(QosNode):
     def await_gate(self, plan: CrashPlan) -> str:
         """Waits for ARMED, with ``changed`` held; returns what is wrong, or nothing."""
         revision = plan.revision
-        self._awaited = revision
+        self._awaited, self._refusal = revision, None
         answered = self.changed.wait_for(
-            lambda: self._armed_revision >= revision or revision in self._refused,
+            lambda: self._armed_revision >= revision or self._refusal is not None,
             timeout=ARM_TIMEOUT_S,
         )
         if not answered:
             problem = f"no gate armed the plan within {ARM_TIMEOUT_S:g} s"
         else:
-            reason = self._refused.get(revision)
-            problem = "" if reason is None else f"the gate refused: {reason}"
+            refusal = self._refusal
+            problem = "" if refusal is None else f"the gate refused: {refusal}"
         # Coaches on one graph overrule each other, gates answer for each other.
         peers = (several(self._coach, topic) for topic in (PLAN_TOPIC, IN_FORCE_TOPIC))
         return "; ".join([problem, *filter(None, peers)]) if problem else ""
@@ -189,12 +189,11 @@ class CoachLink(QosNode):
             if message.kind == FaultEvent.ARMED:
                 self._armed_revision = message.revision
                 self.armed_since = f"armed at step {message.step} of episode {message.episode}"
-                # Not one that is yet to be read: the next episode's plan may be armed by then.
-                self._refused = {r: why for r, why in self._refused.items() if r >= self._awaited}
                 self.control.armed(message.revision, message.step)
                 self.changed.notify_all()
             elif message.kind == FaultEvent.REFUSED:
-                self._refused[message.revision] = message.detail
+                if message.revision == self._awaited:
+                    self._refusal = message.detail
                 self._coach.get_logger().error(f"the gate refused a plan: {message.detail}")
                 self.changed.notify_all()
 

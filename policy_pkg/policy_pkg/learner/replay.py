@@ -95,6 +95,7 @@ class Replay:
         self._success = np.zeros(capacity, np.bool_)
         self._crashed = np.zeros((capacity, n), np.bool_)  # as in ``faults``
         self._added = 0
+        self._chances: npt.NDArray[np.float64] | None = None  # until the content changes
         self._buffers: dict[str, Array] = {}
 
     def __len__(self) -> int:
@@ -134,6 +135,7 @@ class Replay:
         self._success[slot] = success
         self._crashed[slot] = (episode.faults != 0).any(axis=0)
         self._added += 1
+        self._chances = None
 
     def sample(self, rng: np.random.Generator, batch: int) -> Batch:
         """``batch`` different episodes: without strata each set equally likely, with strata drawn
@@ -155,6 +157,11 @@ class Replay:
         Half of it is uniform, half is spread evenly over the strata that exist and within each
         uniform. Without strata all of it is uniform.
         """
+        if self._chances is None:
+            self._chances = self._probabilities()
+        return self._chances
+
+    def _probabilities(self) -> npt.NDArray[np.float64]:
         count = len(self)
         uniform = np.full(count, 1.0 / count)
         if self.strata == "none":
@@ -272,7 +279,7 @@ class Replay:
         faults = self._store["faults"]
         for slot, length in enumerate(lengths):
             self._crashed[slot] = (faults[slot, :length] != 0).any(axis=0)
-        self._added = added
+        self._added, self._chances = added, None
 
 
 def _lazy(shape: tuple[int, ...], dtype: npt.DTypeLike) -> Array:

@@ -6,7 +6,6 @@ import os
 import shutil
 import subprocess
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -18,7 +17,6 @@ from crash_coach_common.contract import UserError
 from policy_pkg.play.own_envs import parallel_env, registered_name
 from sim_pkg.env import scenario_names
 
-ROOT = Path(__file__).resolve().parents[3]
 HALF = {"strategy": "fixed", "crash_rate": 0.5, "resample": False}
 ALWAYS = {**HALF, "crash_rate": 1.0, "min_alive": 0}
 SCENARIOS = ("buttons", "coverage", "transport", "skirmish/3m")

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from crash_coach_bringup.cli.options import (
+    DurationOption,
     ModeOption,
     NamespaceOption,
     ParamOption,
@@ -38,9 +39,7 @@ def inject(
             help="First faulted step of each episode, with --apply-at next_episode.", min=0
         ),
     ] = 0,
-    duration_steps: Annotated[
-        int, typer.Option(help="Control steps; 0: until the episode ends.", min=0)
-    ] = 0,
+    duration_steps: DurationOption = 0,
     clear: Annotated[bool, typer.Option("--clear", help="End every fault instead.")] = False,
     timeout_s: Annotated[
         float, typer.Option(help="Longest wait for the coach, seconds.", min=0.1)
