@@ -3,12 +3,14 @@ policies, no pymunk, torch and numba."""
 
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 
 import bare_environment
 import coach_graph
 import pytest
 from coach_graph import graph, run_to_end
+from node_process import start_file
 
 ABSENT = ("sim_pkg", "policy_pkg", "crash_coach_bringup", "pymunk", "torch", "numba")
 NEEDED = ("numpy", "pydantic", "pyyaml", "ros-diagnostic-msgs", "ros-std-srvs")
@@ -26,11 +28,13 @@ def venv(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def bare(venv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Gate and coach are those of the bare environment."""
 
-    def executable(name: str, package: str) -> str:
+    def start(
+        name: str, package: str, arguments: list[str], env: dict[str, str]
+    ) -> subprocess.Popen[str]:
         assert package == "crash_coach_pkg"
-        return str(bare_environment.program(venv, name, tmp_path))
+        return start_file([str(bare_environment.program(venv, name, tmp_path)), *arguments], env)
 
-    monkeypatch.setattr(coach_graph, "executable", executable)
+    monkeypatch.setattr(coach_graph, "start", start)
 
 
 def test_nothing_else_is_there(venv: Path) -> None:

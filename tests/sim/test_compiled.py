@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 HELPER = """
 from sim_pkg.compiled import helper
 ADDED = 1
@@ -51,11 +53,12 @@ def test_code_is_kept_until_a_file_of_its_package_changes(tmp_path: Path) -> Non
     assert run(changed) == ["7.0", "0"]  # of one change alone it would be 6 or 3
 
 
-def test_others_compile_with_scipy_as_before() -> None:
-    """It is not loaded with the simulator, only for who uses it."""
+@pytest.mark.parametrize("module", ["sim_pkg.compiled", "policy_pkg.learner.replay"])
+def test_others_compile_with_scipy_as_before(module: str) -> None:
+    """It is not loaded with the simulator or the trainer, only for who uses it."""
     code = (
         "import importlib.util, sys, numpy as np\n"
-        "import sim_pkg.compiled\n"
+        f"import {module}\n"
         "from numba import njit\n"
         "print('scipy.linalg' in sys.modules or 'coverage' in sys.modules)\n"
         "importlib.util.find_spec('coverage')\n"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import array
 import os
-import subprocess
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -14,9 +13,9 @@ from pathlib import Path
 from types import MappingProxyType
 
 import rclpy
-from ament_index_python import get_package_prefix
 from coach_operator import WAIT_S, Operator, close
 from crash_coach_interfaces.msg import Action, CrashPlan, EpisodeState, FaultEvent, Observation
+from node_process import NodeProcess, start
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -37,10 +36,6 @@ EVENTS = QoSProfile(depth=1000)
 Key = tuple[int, int]
 
 
-def executable(name: str, package: str) -> str:
-    return str(Path(get_package_prefix(package)) / "lib" / package / name)
-
-
 def arguments(**parameters: object) -> list[str]:
     """--ros-args of parameters; lists, booleans and numbers in YAML's flow style."""
     values = []
@@ -57,18 +52,12 @@ def process(
     package: str = "crash_coach_pkg",
     rules: Sequence[str] = (),
     **parameters: object,
-) -> Iterator[subprocess.Popen[str]]:
+) -> Iterator[NodeProcess]:
     """An executable in a session of its own, gone when the block is left.
 
     ``rules``: remapping, ``from:=to``.
     """
-    child = subprocess.Popen(
-        [executable(name, package), *arguments(**parameters), *remapped(rules)],
-        env=env,
-        text=True,
-        stderr=subprocess.PIPE,
-        start_new_session=True,
-    )
+    child = start(name, package, [*arguments(**parameters), *remapped(rules)], env)
     try:
         yield child
     finally:
@@ -87,15 +76,10 @@ def run_to_end(
     env: dict[str, str], name: str, rules: Sequence[str] = (), **parameters: object
 ) -> tuple[int, str]:
     """Exit code and stderr of an executable that ends by itself."""
-    done = subprocess.run(
-        [executable(name, "crash_coach_pkg"), *arguments(**parameters), *remapped(rules)],
-        env=env,
-        text=True,
-        stderr=subprocess.PIPE,
-        timeout=WAIT_S,
-        check=False,
-    )
-    return done.returncode, done.stderr
+    with process(env, name, rules=rules, **parameters) as child:
+        _, said = child.communicate(timeout=WAIT_S)
+        assert child.returncode is not None
+        return child.returncode, said
 
 
 @dataclass
@@ -253,8 +237,8 @@ class Graph:
     env: dict[str, str]
     team: Team
     operator: Operator
-    gate: subprocess.Popen[str]
-    coach: subprocess.Popen[str]
+    gate: NodeProcess
+    coach: NodeProcess
 
 
 @contextmanager

@@ -9,7 +9,10 @@ import signal
 import subprocess
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from node_process import NodeProcess
 
 FOLDER = Path("/dev/shm")
 _NAME = re.compile(r"fastrtps_(port\d+|[0-9a-f]{16})")
@@ -19,7 +22,7 @@ _GONE_S = 60.0
 _YOUNG_S = 60.0  # may be one whose lock is yet to be taken
 
 
-def kill_group(child: subprocess.Popen[Any]) -> None:
+def kill_group(child: subprocess.Popen[Any] | NodeProcess) -> None:
     """SIGKILL to ``child``'s process group, and what it so left; no-op where it has ended."""
     if child.poll() is not None:
         return

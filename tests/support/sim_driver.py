@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import rclpy
-from ament_index_python.packages import get_package_prefix
+from coach_graph import arguments
 from crash_coach_interfaces.msg import Action, EpisodeState, FaultEvent, Observation
+from node_process import NodeProcess, start
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -29,20 +28,9 @@ WAIT_S = 60.0
 
 
 @contextmanager
-def sim(env: Env, **parameters: object) -> Iterator[subprocess.Popen[str]]:
+def sim(env: Env, **parameters: object) -> Iterator[NodeProcess]:
     """The sim, killed at the end if it still runs."""
-    command = [str(Path(get_package_prefix("sim_pkg")) / "lib" / "sim_pkg" / "sim"), "--ros-args"]
-    for name, value in parameters.items():
-        text = str(value).lower() if isinstance(value, bool) else str(value)
-        command += ["-p", f"{name}:={text}"]
-    process = subprocess.Popen(
-        command,
-        env=env,
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        start_new_session=True,
-    )
+    process = start("sim", "sim_pkg", arguments(**parameters), env)
     try:
         yield process
     finally:
@@ -50,7 +38,7 @@ def sim(env: Env, **parameters: object) -> Iterator[subprocess.Popen[str]]:
         process.communicate(timeout=10)
 
 
-def end_of(process: subprocess.Popen[str], driver: Driver | None = None) -> tuple[int, str]:
+def end_of(process: NodeProcess, driver: Driver | None = None) -> tuple[int, str]:
     """Exit code and stderr, in bounded time; the driver answers meanwhile."""
     if driver is not None:
         driver.until(lambda: process.poll() is not None)

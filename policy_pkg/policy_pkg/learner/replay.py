@@ -22,8 +22,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from crash_coach_common.quick_numba import njit
 from policy_pkg.episode import Episode, Sizes
 from policy_pkg.learner.strata import Strata
 

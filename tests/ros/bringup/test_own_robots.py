@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,11 +9,12 @@ from typing import Any
 
 import pytest
 from ament_index_python.packages import get_package_share_directory
+from node_process import start
 from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 
 from crash_coach_bringup.ros.client import graph_client
-from crash_coach_bringup.ros.graph import Node, node_process, placed
+from crash_coach_bringup.ros.graph import Node, placed
 from crash_coach_bringup.ros.launch_arguments import OWN_ARGUMENTS, own_from
 from crash_coach_bringup.ros.own_robots import OwnRobots, own_nodes
 from crash_coach_common.contract import UserError
@@ -25,14 +25,11 @@ SAMPLE = Path(get_package_share_directory("crash_coach_bringup")) / "config" / "
 
 @contextmanager
 def started(nodes: Sequence[Node], env: dict[str, str]) -> Iterator[None]:
-    children = [
-        subprocess.Popen(node_process(node).argv, env=env, stderr=subprocess.PIPE, text=True)
-        for node in nodes
-    ]
+    children = [start(node.executable, node.package, node.arguments(), env) for node in nodes]
     try:
         yield
         for child in children:
-            assert child.poll() is None, child.communicate()
+            assert child.poll() is None, child.communicate(WAIT_S)
     finally:
         for child in children:
             child.kill()

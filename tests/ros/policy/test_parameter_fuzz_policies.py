@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import array
 import signal
-import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 import pytest
 import rclpy
 from crash_coach_interfaces.msg import Action, Observation
+from node_process import NodeProcess, start
 from parameter_fuzzer import Fuzzer
 from policy_team import ALL, OBS, SPEC
 from rclpy.context import Context
@@ -22,7 +22,7 @@ from rclpy.node import Node as RclNode
 from rclpy.qos import QoSProfile
 from shared_memory import kill_group
 
-from crash_coach_bringup.ros.graph import Node, node_process
+from crash_coach_bringup.ros.graph import Node
 from policy_pkg.untrained import write_untrained
 
 SIZES = [40, pytest.param(5000, marks=pytest.mark.soak)]
@@ -32,7 +32,7 @@ WORDS = (*SPEC.robots, "command", "observation_seen", "mute", "lockstep", "")
 class Fuzzed:
     """One node in a process of its own, and another one that calls it."""
 
-    def __init__(self, process: subprocess.Popen[str], node: RclNode) -> None:
+    def __init__(self, process: NodeProcess, node: RclNode) -> None:
         self.process = process
         self.node = node
         self.executor = SingleThreadedExecutor(context=node.context)
@@ -61,14 +61,8 @@ class Fuzzed:
 def fuzzed(env: dict[str, str], executable: str, **parameters: Any) -> Iterator[Fuzzed]:
     context = Context()
     rclpy.init(context=context)
-    process = subprocess.Popen(
-        node_process(Node(executable, "policy_pkg", executable, parameters)).argv,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env=env,
-        start_new_session=True,
-    )
+    started = Node(executable, "policy_pkg", executable, parameters)
+    process = start(executable, "policy_pkg", started.arguments(), env, merged=True)
     node = RclNode("fuzzer", context=context)
     one = Fuzzed(process, node)
     try:

@@ -6,13 +6,15 @@ import array
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pytest
 from crash_coach_interfaces.msg import Action, Observation
+from node_process import NodeProcess, start, start_file
 from policy_team import ALL, OBS, ROBOTS, SPEC, make_agent, sense
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
@@ -25,6 +27,8 @@ from policy_pkg.agent import Answer, Sensed
 from policy_pkg.checkpoint import PolicyBundle, load_policy
 from policy_pkg.ros.convert import bytes_from_answer, sensed_from_bytes
 from policy_pkg.untrained import write_untrained
+
+Child = TypeVar("Child", NodeProcess, subprocess.Popen[str])
 
 
 @pytest.fixture(scope="module")
@@ -69,20 +73,19 @@ def test_the_wire_format_is_rclpys(frame_id: str, sizes: tuple[int, int]) -> Non
 
 
 @contextmanager
-def running(node: Node, env: dict[str, str]) -> Iterator[subprocess.Popen[str]]:
-    child = subprocess.Popen(
-        node_process(node).argv,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env=env,
-        start_new_session=True,
-    )
+def killed_at_the_end(child: Child) -> Iterator[Child]:
     try:
         yield child
     finally:
         kill_group(child)
         child.communicate(timeout=10)
+
+
+def running(
+    node: Node, env: dict[str, str], merged: bool = True
+) -> AbstractContextManager[NodeProcess]:
+    child = start(node.executable, node.package, node.arguments(), env, merged)
+    return killed_at_the_end(child)
 
 
 class Bench:
@@ -139,9 +142,10 @@ def test_a_policy_process_answers_without_torch_or_sim(
     rng = np.random.default_rng(11)
     reference = make_agent(bundle, ("robot_2",))
     parameters = {"checkpoint": str(checkpoint), "robot": "robot_2"}
+    node = Node("policy_robot_2", "policy_pkg", "policy", parameters)
     started = time.monotonic()
     with (
-        running(Node("policy_robot_2", "policy_pkg", "policy", parameters), ros_env) as child,
+        killed_at_the_end(start_file(node_process(node).argv, ros_env)) as child,
         graph_client("bench") as client,
     ):
         bench = Bench(client, ("robot_2",))
@@ -228,15 +232,9 @@ def test_bad_parameters_are_one_line_and_exit_code_1(
 ) -> None:
     filled = {k: str(checkpoint) if v == "HERE" else v for k, v in parameters.items()}
     node = Node(executable, "policy_pkg", executable, filled)
-    done = subprocess.run(
-        node_process(node).argv,
-        capture_output=True,
-        text=True,
-        env=ros_env,
-        timeout=100,
-        check=False,
-    )
-    assert done.returncode == 1
-    assert done.stderr.startswith(f"{executable}: error: ")
-    assert message in done.stderr
-    assert len(done.stderr.splitlines()) == 1
+    with running(node, ros_env, merged=False) as child:
+        _, said = child.communicate(timeout=100)
+    assert child.returncode == 1
+    assert said.startswith(f"{executable}: error: ")
+    assert message in said
+    assert len(said.splitlines()) == 1
