@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -58,10 +59,21 @@ def select(page: Page, robot: str) -> None:
     """A click on the robot where it is drawn, while the sim stands."""
     page.get_by_role("button", name="Pause").click()
     page.locator(".banner", has_text="paused").wait_for()
-    page.wait_for_function("() => !crashCoach.stages[0].dirty")
-    at = page.evaluate(f"crashCoach.stages[0].places().find((place) => place.name === {robot!r})")
-    page.locator("canvas").first.click(position={"x": at["x"], "y": at["y"]})
-    page.locator(".chip[aria-pressed=true]", has_text=robot).wait_for()
+    chosen = page.locator(".chip[aria-pressed=true]", has_text=robot)
+    deadline_s = time.monotonic() + WAIT_S
+    click_s = 0.0
+    while not chosen.is_visible():
+        now_s = time.monotonic()
+        assert now_s < deadline_s, f"clicks on {robot} do not choose it"
+        if now_s >= click_s:
+            # Where it stands may be told after the pause is: then one clicks once more.
+            click_s = now_s + WAIT_S / 10
+            page.wait_for_function("() => !crashCoach.stages[0].dirty")
+            at = page.evaluate(
+                f"crashCoach.stages[0].places().find((place) => place.name === {robot!r})"
+            )
+            page.locator("canvas").first.click(position={"x": at["x"], "y": at["y"]})
+        page.wait_for_timeout(50)
     page.get_by_role("button", name="Go on").click()
     page.locator(".banner", has_text="paused").wait_for(state="hidden")
 
