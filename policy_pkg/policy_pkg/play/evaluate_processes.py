@@ -13,6 +13,7 @@ from multiprocessing.context import SpawnProcess
 from typing import NamedTuple
 
 from crash_coach_common.contract import UserError
+from crash_coach_common.spawned import hear, start_deaf
 from policy_pkg.checkpoint import PolicyBundle
 from policy_pkg.play.conditions import Condition
 from policy_pkg.play.evaluate import Evaluation, Scripted, evaluate
@@ -68,7 +69,7 @@ def _play_apart(task: _Task, shares: Sequence[range]) -> list[list[Evaluation]]:
         for _ in shares:
             ours, theirs = context.Pipe()
             process = context.Process(target=_work, args=(theirs,), daemon=True)
-            process.start()
+            start_deaf(process)
             theirs.close()  # so that the pipe ends with the process
             started.append((process, ours))
         # Not as arguments of the processes: where one died as it began, they would wait for ever.
@@ -101,6 +102,7 @@ def _told_of_death(process: SpawnProcess) -> Iterator[None]:
 
 def _work(connection: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    hear()
     result: list[Evaluation] | UserError
     with suppress(EOFError, ConnectionError):  # nobody waits for it any more
         task, share = connection.recv()

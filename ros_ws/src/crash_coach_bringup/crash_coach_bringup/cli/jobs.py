@@ -19,6 +19,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from crash_coach_bringup.cli import signals
 from crash_coach_bringup.cli.output import console, surroundings
 from crash_coach_common.contract import UserError
+from crash_coach_common.spawned import hear, start_deaf
 from policy_pkg.checkpoint import CHECKPOINTS, list_checkpoints
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ def _work(index: int, job: Job, parent: int, out: Queue[Message]) -> None:
     """A training process; ends by itself where its parent is gone."""
     interrupted = threading.Event()
     signal.signal(signal.SIGINT, lambda *_: interrupted.set())
+    hear()
     # Imported here: only training processes need torch.
     from policy_pkg.train.run import EndedEarly, train
 
@@ -119,7 +121,7 @@ class _Runner:
             process = self.context.Process(
                 target=_work, args=(index, job, os.getpid(), self.messages), daemon=True
             )
-            process.start()
+            start_deaf(process)
             self.running[index] = process
 
     def take(self, message: Message) -> None:
