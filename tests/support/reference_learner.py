@@ -28,7 +28,6 @@ class Reference:
     drop_crashed: bool = False
     crashed_target: str = "max"
     td_lambda: float = 0.0
-    td_lambda_crashed: float | None = None
 
 
 def random_episode(
@@ -156,11 +155,8 @@ def loss(
                 following = [mix(ref.algorithm, target, following, episode.state[t + 1]).detach()]
                 taken = [mix(ref.algorithm, online, taken, episode.state[t])]
             if later:
-                share = ref.td_lambda
-                if ref.td_lambda_crashed is not None and episode.faults[t + 1].any():
-                    share = ref.td_lambda_crashed
                 following = [
-                    (1 - share) * value + share * ahead
+                    (1 - ref.td_lambda) * value + ref.td_lambda * ahead
                     for value, ahead in zip(following, later, strict=True)
                 ]
             later = [reward + discount * value for value in following]

@@ -66,13 +66,6 @@ class LearnerConfig(BaseModel):
         le=1.0,
         description="share of the lambda-return in the target; 0: one-step targets",
     )
-    td_lambda_crashed: float | None = Field(
-        default=None,
-        ge=0.0,
-        le=1.0,
-        description="td_lambda towards a step with a fault in force, where actions were not all "
-        "the team's choice; none: as everywhere",
-    )
     double_q: bool = Field(
         default=True,
         description="choose the next action by the online net, value it by the target net",

@@ -9,10 +9,6 @@ its end backwards and without cuts, V the target's value above:
 
     y_t = r_t + gamma * ((1 - lambda) * V(s_t+1) + lambda * y_t+1),  one-step at the last t
 
-With td_lambda_crashed, lambda is that one where a fault is in force at t+1: what was executed then,
-and earned in y_t+1, the team did not choose. 0 cuts there, as Watkins's Q(lambda) (1989) does after
-an exploratory action,
-
 as in double Q-learning (van Hasselt et al. 2016) with QMIX's Q_tot; VDN's is the sum of the robots'
 values (Sunehag et al. 2018); IQL has no mixer: each robot gets the team's reward and the mean runs
 over steps and robots. On fixed data a conservative term is added, conservative_weight times
@@ -113,7 +109,7 @@ def loss(
         q_target = steps.after(steps.values(target))
         following = next_values(config, sizes, steps, steps.after(q), q_target)
         following = target.mix(following, steps.after(steps.state))
-        returns = lambda_returns(steps, following, config)
+        returns = lambda_returns(steps, following, config.gamma, config.td_lambda)
 
     error = returns - total
     count = error.numel()
@@ -156,42 +152,27 @@ def next_values(
     return torch.where(steps.faulted, crashed, values)
 
 
-def lambda_returns(steps: Steps, following: Tensor, config: LearnerConfig) -> Tensor:
+def lambda_returns(steps: Steps, following: Tensor, gamma: float, td_lambda: float) -> Tensor:
     """y of every step, shaped as ``following``: (M,) of the team, for iql (M, n).
 
     The steps at t are ``alive[t + 1]`` rows; row i of them is followed by row i of the next t,
     where there is one: the returns come from the last t backwards.
     """
     reward = _per_step(steps.reward, following)
-    discount = config.gamma * _per_step(steps.bootstrap, following)
-    if config.td_lambda == 0 and not config.td_lambda_crashed:
+    discount = gamma * _per_step(steps.bootstrap, following)
+    if td_lambda == 0:
         return reward + discount * following
     counts = steps.alive[1:]
     parts = [size for now, later in pairwise([*counts, 0]) for size in (later, now - later)]
-    weight = _per_step(_lambdas(steps, config, parts, following.dtype), following)
+    goes_on = torch.tensor([1.0, 0.0] * len(counts), dtype=following.dtype)
+    goes_on = goes_on.repeat_interleave(torch.tensor(parts)).to(following.device)
+    weight = td_lambda * _per_step(goes_on, following)  # of y_t+1; 0 at the last t
     returns = reward + discount * (1 - weight) * following
     here, later = returns.split_with_sizes(parts)[::2], returns.split_with_sizes(counts)[1:]
     share = (discount * weight).split_with_sizes(parts)[::2]
     for t in range(len(later) - 1, -1, -1):
         here[t].addcmul_(share[t], later[t])
     return returns
-
-
-def _lambdas(steps: Steps, config: LearnerConfig, parts: list[int], dtype: torch.dtype) -> Tensor:
-    """(M,) the weight of y_t+1 in y_t; 0 at an episode's last t.
-
-    parts: of the steps at each t, how many go on and how many do not.
-    """
-    device = steps.faults.device
-    goes_on = torch.tensor([1.0, 0.0] * (len(parts) // 2), dtype=dtype)
-    goes_on = goes_on.repeat_interleave(torch.tensor(parts)).to(device)
-    if config.td_lambda_crashed is None:
-        return config.td_lambda * goes_on
-    towards = torch.full((len(goes_on),), config.td_lambda, dtype=dtype, device=device)
-    towards[steps.faulted.any(1)] = config.td_lambda_crashed
-    # All steps but the first of each episode, in order, follow those that go on, in order.
-    goes_on[goes_on > 0] = towards[sum(parts[:2]) :]
-    return goes_on
 
 
 def cross_entropy(q: Tensor, steps: Steps, keep_crashed: bool) -> Tensor:

@@ -80,12 +80,11 @@ class OfflineConfig(RunSettings):
                 f"learner.conservative_weight {self.learner.conservative_weight:g} has no effect "
                 "with behaviour_cloning; set it to 0"
             )
-        for name in ("td_lambda", "td_lambda_crashed"):
-            value = getattr(self.learner, name)
-            if self.method == "behaviour_cloning" and value:
-                raise ValueError(
-                    f"learner.{name} {value:g} has no effect with behaviour_cloning; set it to 0"
-                )
+        if self.method == "behaviour_cloning" and self.learner.td_lambda > 0:
+            raise ValueError(
+                f"learner.td_lambda {self.learner.td_lambda:g} has no effect with "
+                "behaviour_cloning; set it to 0"
+            )
         return self
 
     @model_validator(mode="after")
