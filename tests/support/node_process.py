@@ -13,12 +13,12 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
-from typing import NoReturn
+from typing import IO, NoReturn
 
 from ament_index_python import get_package_prefix
 
@@ -61,7 +61,7 @@ class NodeProcess:
         self.stdout, self.stderr = (os.fdopen(os.dup(end.fileno())) for end in read)
         for end in read:
             end.close()
-        self._said: tuple[str, str] | None = None
+        self._reading: list[Future[str]] = []
 
     @property
     def returncode(self) -> int | None:
@@ -85,16 +85,14 @@ class NodeProcess:
         return self._process.exitcode
 
     def communicate(self, timeout: float) -> tuple[str, str]:
-        """What it wrote until its end. Raises subprocess.TimeoutExpired."""
-        if self._said is None:
-            with ThreadPoolExecutor(2) as pool:
-                reading = [pool.submit(file.read) for file in (self.stdout, self.stderr)]
-                self.wait(timeout)
-                out, err = (each.result(timeout) for each in reading)
-            self._said = out, err
-            self.stdout.close()
-            self.stderr.close()
-        return self._said
+        """What it wrote until its end. Raises TimeoutExpired or, for a pipe, TimeoutError."""
+        if not self._reading:
+            pool = ThreadPoolExecutor(2)
+            self._reading = [pool.submit(_read, file) for file in (self.stdout, self.stderr)]
+            pool.shutdown(wait=False)
+        self.wait(timeout)
+        out, err = (each.result(timeout) for each in self._reading)
+        return out, err
 
 
 def start(
@@ -118,6 +116,11 @@ def _server() -> ForkServerContext:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__, *NODES])
     return context
+
+
+def _read(file: IO[str]) -> str:
+    with file:
+        return file.read()
 
 
 def _run(
