@@ -102,9 +102,9 @@ class _Both:
     def updates(self) -> int:
         return self._learner.updates
 
-    def update(self, batch: Batch, *, episodes: int) -> dict[str, float]:
+    def update(self, batch: Batch, **how: Any) -> dict[str, float]:
         started_s = time.process_time()
-        metrics = self._learner.update(batch, episodes=episodes)
+        metrics = self._learner.update(batch, **how)
         middle_s = time.process_time()
         self._numpy.update(batch)
         self.ours_s += middle_s - started_s

@@ -15,7 +15,7 @@ from types import MappingProxyType
 import rclpy
 from coach_operator import WAIT_S, Operator, close
 from crash_coach_interfaces.msg import Action, CrashPlan, EpisodeState, FaultEvent, Observation
-from node_process import NodeProcess, start
+from node_process import Child, start
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -52,7 +52,7 @@ def process(
     package: str = "crash_coach_pkg",
     rules: Sequence[str] = (),
     **parameters: object,
-) -> Iterator[NodeProcess]:
+) -> Iterator[Child]:
     """An executable in a session of its own, gone when the block is left.
 
     ``rules``: remapping, ``from:=to``.
@@ -237,8 +237,8 @@ class Graph:
     env: dict[str, str]
     team: Team
     operator: Operator
-    gate: NodeProcess
-    coach: NodeProcess
+    gate: Child
+    coach: Child
 
 
 @contextmanager

@@ -23,6 +23,7 @@ from typing import IO, NoReturn
 from ament_index_python import get_package_prefix
 
 START_S = 60.0
+_LOADING = ("LD_LIBRARY_PATH", "LD_PRELOAD", "PYTHONPATH")
 NODES = (
     "crash_coach_pkg.ros.coach_node",
     "crash_coach_pkg.ros.gate_node",
@@ -95,18 +96,29 @@ class NodeProcess:
         return out, err
 
 
+Child = NodeProcess | subprocess.Popen[str]
+
+
 def start(
     name: str, package: str, arguments: Sequence[str], env: dict[str, str], merged: bool = False
-) -> NodeProcess:
+) -> Child:
     """In a session of its own, with no other environment than ``env``."""
+    if any(env.get(variable) != os.environ.get(variable) for variable in _LOADING):
+        return start_file([executable(name, package), *arguments], env, merged)  # it loads others
     return NodeProcess(name, package, arguments, env, merged)
 
 
-def start_file(argv: Sequence[str], env: dict[str, str]) -> subprocess.Popen[str]:
+def start_file(
+    argv: Sequence[str], env: dict[str, str], merged: bool = False
+) -> subprocess.Popen[str]:
     """As ``start``, but the file that is installed: where it matters what it loads."""
-    pipe = subprocess.PIPE
     return subprocess.Popen(
-        argv, env=env, text=True, stdout=pipe, stderr=pipe, start_new_session=True
+        argv,
+        env=env,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT if merged else subprocess.PIPE,
+        start_new_session=True,
     )
 
 

@@ -6,13 +6,12 @@ import fcntl
 import os
 import re
 import signal
-import subprocess
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from node_process import NodeProcess
+    from node_process import Child
 
 FOLDER = Path("/dev/shm")
 _NAME = re.compile(r"fastrtps_(port\d+|[0-9a-f]{16})")
@@ -22,7 +21,7 @@ _GONE_S = 60.0
 _YOUNG_S = 60.0  # may be one whose lock is yet to be taken
 
 
-def kill_group(child: subprocess.Popen[Any] | NodeProcess) -> None:
+def kill_group(child: Child) -> None:
     """SIGKILL to ``child``'s process group, and what it so left; no-op where it has ended."""
     if child.poll() is not None:
         return

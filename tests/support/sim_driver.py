@@ -11,7 +11,7 @@ from typing import Any
 import rclpy
 from coach_graph import arguments
 from crash_coach_interfaces.msg import Action, EpisodeState, FaultEvent, Observation
-from node_process import NodeProcess, start
+from node_process import Child, start
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -28,7 +28,7 @@ WAIT_S = 60.0
 
 
 @contextmanager
-def sim(env: Env, **parameters: object) -> Iterator[NodeProcess]:
+def sim(env: Env, **parameters: object) -> Iterator[Child]:
     """The sim, killed at the end if it still runs."""
     process = start("sim", "sim_pkg", arguments(**parameters), env)
     try:
@@ -38,7 +38,7 @@ def sim(env: Env, **parameters: object) -> Iterator[NodeProcess]:
         process.communicate(timeout=10)
 
 
-def end_of(process: NodeProcess, driver: Driver | None = None) -> tuple[int, str]:
+def end_of(process: Child, driver: Driver | None = None) -> tuple[int, str]:
     """Exit code and stderr, in bounded time; the driver answers meanwhile."""
     if driver is not None:
         driver.until(lambda: process.poll() is not None)

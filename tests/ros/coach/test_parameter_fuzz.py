@@ -8,7 +8,7 @@ from functools import partial
 import pytest
 from coach_graph import ROBOTS, Team, graph
 from crash_coach_interfaces.msg import CrashPlan
-from node_process import NodeProcess
+from node_process import Child
 from parameter_fuzzer import Fuzzer
 from rcl_interfaces.msg import ParameterValue
 from rclpy.parameter import parameter_value_to_python
@@ -55,7 +55,7 @@ def check_plan(team: Team, episode: int, settings: ControlSettings) -> None:
         assert plan.faults == Coach(settings.coach, TEAM, settings.seed).plan(episode).faults
 
 
-def check_life(*processes: NodeProcess) -> None:
+def check_life(*processes: Child) -> None:
     for process in processes:
         if process.poll() is not None:
             raise AssertionError(f"a node ended: {process.communicate(timeout=10)[1]}")

@@ -21,7 +21,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from fleet_drivers import BEST_EFFORT, PERIOD_S, ROVERS, SPEED_M_S, Drivers
 from geometry_msgs.msg import Twist, TwistStamped
 from kept_running import kept_running
-from node_process import NodeProcess
+from node_process import Child
 from rclpy.serialization import deserialize_message, serialize_message
 
 from crash_coach_bringup.ros import discovery
@@ -39,7 +39,7 @@ LIMIT_M_S, LIMIT_RAD_S = 0.4, 0.7
 class Fleet:
     drivers: Drivers
     operator: Operator
-    coach: NodeProcess
+    coach: Child
 
     def fault(self, mode: str, victim: str = VICTIM, **parameters: float) -> int:
         """From its return on, every later step of ``victim`` is faulted; the number sent last."""

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import rclpy
 from crash_coach_interfaces.msg import Action, Observation
-from node_process import NodeProcess, start
+from node_process import Child, start
 from parameter_fuzzer import Fuzzer
 from policy_team import ALL, OBS, SPEC
 from rclpy.context import Context
@@ -32,7 +32,7 @@ WORDS = (*SPEC.robots, "command", "observation_seen", "mute", "lockstep", "")
 class Fuzzed:
     """One node in a process of its own, and another one that calls it."""
 
-    def __init__(self, process: NodeProcess, node: RclNode) -> None:
+    def __init__(self, process: Child, node: RclNode) -> None:
         self.process = process
         self.node = node
         self.executor = SingleThreadedExecutor(context=node.context)

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import array
-import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import pytest
 from crash_coach_interfaces.msg import Action, Observation
-from node_process import NodeProcess, start, start_file
+from node_process import Child, start, start_file
 from policy_team import ALL, OBS, ROBOTS, SPEC, make_agent, sense
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
@@ -27,8 +25,6 @@ from policy_pkg.agent import Answer, Sensed
 from policy_pkg.checkpoint import PolicyBundle, load_policy
 from policy_pkg.ros.convert import bytes_from_answer, sensed_from_bytes
 from policy_pkg.untrained import write_untrained
-
-Child = TypeVar("Child", NodeProcess, subprocess.Popen[str])
 
 
 @pytest.fixture(scope="module")
@@ -81,9 +77,7 @@ def killed_at_the_end(child: Child) -> Iterator[Child]:
         child.communicate(timeout=10)
 
 
-def running(
-    node: Node, env: dict[str, str], merged: bool = True
-) -> AbstractContextManager[NodeProcess]:
+def running(node: Node, env: dict[str, str], merged: bool = True) -> AbstractContextManager[Child]:
     child = start(node.executable, node.package, node.arguments(), env, merged)
     return killed_at_the_end(child)
 
