@@ -20,7 +20,7 @@ from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import IO, NoReturn
 
-from ament_index_python import get_package_prefix
+from crash_coach_bringup.ros.probe import find_executable
 
 START_S = 60.0
 _LOADING = ("LD_LIBRARY_PATH", "LD_PRELOAD", "PYTHONPATH")
@@ -33,10 +33,6 @@ NODES = (
 )
 
 
-def executable(name: str, package: str) -> str:
-    return str(Path(get_package_prefix(package)) / "lib" / package / name)
-
-
 class NodeProcess:
     """A running executable: as much of subprocess.Popen, with pipes of text, as tests use.
 
@@ -46,7 +42,7 @@ class NodeProcess:
     def __init__(
         self, name: str, package: str, arguments: Sequence[str], env: dict[str, str], merged: bool
     ) -> None:
-        argv = [executable(name, package), *arguments]
+        argv = [str(find_executable(package, name)), *arguments]
         pipes = [_server().Pipe(duplex=False) for _ in range(3)]
         (session, *read), (begun, out, err) = zip(*pipes, strict=True)
         self._process = _server().Process(
@@ -104,7 +100,8 @@ def start(
 ) -> Child:
     """In a session of its own, with no other environment than ``env``."""
     if any(env.get(variable) != os.environ.get(variable) for variable in _LOADING):
-        return start_file([executable(name, package), *arguments], env, merged)  # it loads others
+        # It loads other modules than the server has.
+        return start_file([str(find_executable(package, name)), *arguments], env, merged)
     return NodeProcess(name, package, arguments, env, merged)
 
 

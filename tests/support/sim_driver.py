@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from functools import partial
 from typing import Any
 
 import rclpy
-from coach_graph import arguments
+from coach_graph import process
 from crash_coach_interfaces.msg import Action, EpisodeState, FaultEvent, Observation
-from node_process import Child, start
+from node_process import Child
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from shared_memory import kill_group
 from std_srvs.srv import Trigger
 
 from crash_coach_bringup.ros.client import greet
@@ -27,15 +26,9 @@ UP, DOWN, LEFT, RIGHT, STAY = range(5)
 WAIT_S = 60.0
 
 
-@contextmanager
-def sim(env: Env, **parameters: object) -> Iterator[Child]:
+def sim(env: Env, **parameters: object) -> AbstractContextManager[Child]:
     """The sim, killed at the end if it still runs."""
-    process = start("sim", "sim_pkg", arguments(**parameters), env)
-    try:
-        yield process
-    finally:
-        kill_group(process)
-        process.communicate(timeout=10)
+    return process(env, "sim", "sim_pkg", **parameters)
 
 
 def end_of(process: Child, driver: Driver | None = None) -> tuple[int, str]:

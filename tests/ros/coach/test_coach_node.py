@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import signal
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -54,7 +55,15 @@ def test_plans_equal_the_cores_and_heartbeats_repeat_them(ros_env: dict[str, str
             assert victims(plan) == [ROBOTS[fault.robot] for fault in expected.faults]
             assert (plan.rate, plan.cap, plan.seed) == (0.5, expected.cap, 11)
         t.plans.clear()
-        t.until(lambda: len(t.plans) >= 3, "heartbeats")
+        told_s: list[float] = []
+
+        def three_in_time() -> bool:  # lease_s is 1; a busy machine may miss it once
+            told_s.extend([time.monotonic()] * (len(t.plans) - len(told_s)))
+            return any(
+                third - first <= 1.2 for first, third in zip(told_s[:-2], told_s[2:], strict=True)
+            )
+
+        t.until(three_in_time, "three heartbeats within 1.2 s")
         assert {plan.revision for plan in t.plans} == {plan.revision}
 
 
