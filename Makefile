@@ -27,10 +27,10 @@ check: setup mlflow environments ## ruff, mypy, the laws of architecture and pac
 	    ros_ws/src/crash_coach_bringup/crash_coach_bringup \
 	    ros_ws/src/crash_coach_console/crash_coach_console scripts benchmarks
 	$(IN_ENV) oxlint --quiet --deny-warnings $(PAGE)
-	$(IN_ENV) $(PYTEST) $(SIDE_BY_SIDE) -n 2 $(CHECKED)
+	$(IN_ENV) $(PYTEST) $(SIDE_BY_SIDE) -n 2 -o faulthandler_timeout=1300 $(CHECKED)
 
 test: setup ## the test suite (but for what `make check` runs), about 5 minutes on 2 cores
-	$(IN_ENV) $(PYTEST) $(SIDE_BY_SIDE) -n 4 $(CHECKED:%=--ignore=%)
+	$(IN_ENV) $(PYTEST) $(SIDE_BY_SIDE) -n 4 -o faulthandler_timeout=400 $(CHECKED:%=--ignore=%)
 
 demo: setup ## train two teams, run them as ROS graphs, crash robots, read off the cost
 	$(IN_ENV) crash-coach demo $(DEMO_OPTIONS)
@@ -39,7 +39,7 @@ bench: setup ## every benchmark, to runs/bench.json
 	$(IN_ENV) python -m benchmarks
 
 soak: setup ray mlflow torchrl environments ## fuzz, kill and latency tests at full size
-	$(IN_ENV) $(PYTEST) -m soak --timeout 3600
+	$(IN_ENV) $(PYTEST) -m soak --timeout 3600 -o faulthandler_timeout=3700
 
 ray: setup ## the extra that `crash-coach sweep --engine ray` needs
 	@.venv/bin/uv pip install --quiet --python .venv/bin/python -r requirements-ray.lock

@@ -23,6 +23,17 @@ settings.register_profile("here", deadline=None)
 settings.load_profile("here")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files that mostly wait, for graphs and pages, spread between files that compute."""
+    files = list(dict.fromkeys(item.path for item in items))
+    waiting = [path for path in files if {"ros", "console"} & set(path.parts)]
+    computing = [path for path in files if path not in waiting]
+    at = {
+        path: (i + 0.5) / len(kind) for kind in (waiting, computing) for i, path in enumerate(kind)
+    }
+    items.sort(key=lambda item: at[item.path])
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
     if not hasattr(session.config, "workerinput"):  # once, before pytest-xdist's workers
         remove_left_behind()

@@ -13,7 +13,9 @@ from in_process import refused, typed
 from crash_coach_bringup.cli.main import repeat_options
 from crash_coach_bringup.cli.options import conditions, mode_parameters, timed
 from crash_coach_bringup.cli.output import CliError, check_json_target, write_json
+from crash_coach_bringup.cli.verbs.doctor import shared_memory
 from crash_coach_bringup.cli.verbs.train import plan_jobs
+from crash_coach_bringup.ros import probe
 from crash_coach_bringup.ros.probe import find_executable
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
@@ -271,6 +273,30 @@ def test_doctor_finds_this_machine_fit(ros_env: dict[str, str], tmp_path: Path) 
     findings = {row["check"]: row for row in json.loads(out.read_text())["findings"]}
     assert done.returncode == 0, done.stdout
     assert {"Python", "torch", "messages", "executables", "DDS on this machine"} <= set(findings)
+    assert findings["shared memory"]["ok"]
+
+
+def test_doctor_names_a_segment_that_a_killed_node_left_half_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(probe, "SHARED_MEMORY", tmp_path)
+    contents = {
+        "fastrtps_port7011": bytes(8),
+        "fastrtps_port7012": b"\2" + bytes(7),
+        "fastrtps_port7011_el": b"",  # a lock
+        "fastrtps_0123456789abcdef": b"",
+        "sem.fastrtps_port7011_mutex": bytes(8),
+    }
+    for name, content in contents.items():
+        (tmp_path / name).write_bytes(content)
+    assert probe.half_made(tmp_path) == []  # they may be about to be made
+    for name in contents:
+        os.utime(tmp_path / name, (0, 0))
+    left = [tmp_path / "fastrtps_0123456789abcdef", tmp_path / "fastrtps_port7011"]
+    assert probe.half_made(tmp_path) == left
+    finding = shared_memory()
+    assert not finding.ok
+    assert f"rm {left[0]} {left[1]}" in finding.hint
 
 
 def test_doctor_names_what_is_missing(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from crash_coach_pkg.coach.parameters import build_settings
 from crash_coach_pkg.team import TeamSpec
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Browser, ConsoleMessage, Error, Page
 
 PLACES = "crashCoach.stages[0].places().map((place) => [place.x, place.y])"
 MOVED = f"""(before) => {PLACES}.some(([x, y], i) =>
@@ -26,32 +26,54 @@ PHONE = {"width": 375, "height": 740}
 DESK = {"width": 1600, "height": 1000}
 
 
-@pytest.fixture
-def page(browser: Browser, teams: Teams) -> Iterator[Page]:
-    """On the first team, drawn; every fault of both is cleared afterwards."""
-    yield from opened(browser, teams, teams.one)
-
-
-@pytest.fixture
-def two(browser: Browser, teams: Teams) -> Iterator[Page]:
-    """On both teams."""
-    yield from opened(browser, teams, teams.both)
-
-
-def opened(browser: Browser, teams: Teams, address: str) -> Iterator[Page]:
-    made = browser.new_page(viewport=DESK)  # type: ignore[arg-type]
-    problems: list[str] = []
-    made.on("pageerror", lambda error: problems.append(str(error)))
-    made.on("console", lambda m: problems.append(m.text) if m.type == "error" else None)
+@pytest.fixture(scope="module")
+def tab(browser: Browser) -> Iterator[Page]:
+    """One for all tests: the browser starts two processes for every other, a CPU second each."""
+    made = browser.new_page()
     made.set_default_timeout(1000 * WAIT_S)
-    made.goto(address)
-    made.wait_for_function(
-        "() => crashCoach.stages.length && crashCoach.stages.every("
-        "(stage) => stage.places().length > 0 && stage.status.ready)"
-    )
     yield made
     made.close()
+
+
+@pytest.fixture
+def page(tab: Page, teams: Teams) -> Iterator[Page]:
+    """On the first team, drawn; every fault of both is cleared afterwards."""
+    yield from on_graphs(tab, teams, teams.one, 1)
+
+
+@pytest.fixture
+def two(tab: Page, teams: Teams) -> Iterator[Page]:
+    """On both teams."""
+    yield from on_graphs(tab, teams, teams.both, 2)
+
+
+def on_graphs(tab: Page, teams: Teams, address: str, stages: int) -> Iterator[Page]:
+    yield from opened(tab, address, stages, "stage.places().length > 0 && stage.status.ready")
     teams.clear()
+
+
+def opened(tab: Page, address: str, stages: int, drawn: str) -> Iterator[Page]:
+    problems: list[str] = []
+
+    def failed(error: Error) -> None:
+        problems.append(str(error))
+
+    def told(message: ConsoleMessage) -> None:
+        if message.type == "error":
+            problems.append(message.text)
+
+    tab.on("pageerror", failed)
+    tab.on("console", told)
+    tab.set_viewport_size(DESK)  # type: ignore[arg-type]
+    tab.goto(address)
+    tab.wait_for_function(
+        f"() => crashCoach.stages.length === {stages}"
+        f" && crashCoach.stages.every((stage) => {drawn})"
+    )
+    yield tab
+    tab.goto("about:blank")
+    tab.remove_listener("pageerror", failed)
+    tab.remove_listener("console", told)
     assert problems == []
 
 
@@ -178,17 +200,9 @@ def test_two_teams_side_by_side_are_crashed_alike_or_one_alone(two: Page, teams:
 
 
 @pytest.fixture
-def over(browser: Browser, episodes: str) -> Iterator[Page]:
+def over(tab: Page, episodes: str) -> Iterator[Page]:
     """A recording, and beside it a run, without ROS."""
-    made = browser.new_page(viewport=DESK)  # type: ignore[arg-type]
-    made.set_default_timeout(1000 * WAIT_S)
-    made.goto(episodes)
-    made.wait_for_function(
-        "() => crashCoach.stages.length === 2"
-        " && crashCoach.stages.every((stage) => stage.places().length > 0)"
-    )
-    yield made
-    made.close()
+    yield from opened(tab, episodes, 2, "stage.places().length > 0")
 
 
 STEP = "() => crashCoach.stages[{}].motion.newest.step"

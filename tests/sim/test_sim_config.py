@@ -40,7 +40,8 @@ STARTS = "  - [2, 1]\n  - [7, 8]\n"
         ("kind: buttons", "kind: [buttons]", r"kind = \['buttons'\].*; one of: buttons"),
         ("dt_s: 1.0", "dt_s: 1.0\n\a", r"bad.yaml:8: not valid YAML: control character"),
         (STARTS, " &x [*x]\n", r"an alias contains itself"),
-        ("rows: 10", "rows: [10", r"not valid YAML"),
+        (STARTS, " [*mine]\n", r"bad.yaml:10: not valid YAML: .*alias in '\[\*mine\]'"),
+        ("rows: 10", "rows: [10", r"bad.yaml:\d+: not valid YAML: while parsing a flow sequence"),
     ],
 )
 def test_bad_scenarios(tmp_path: Path, old: str, new: str, message: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 from crash_coach_interfaces.msg import EpisodeState, FaultEvent
@@ -145,5 +146,7 @@ class SimTopics:
 
     def flush(self) -> None:
         """Waits, within bounds, until every reader has the last episode state and boundary."""
+        deadline_s = time.monotonic() + _ACK_TIMEOUT_S
         for publisher in (self._episode_pub, self._boundary_pub):
-            publisher.wait_for_all_acked(Duration(seconds=_ACK_TIMEOUT_S))
+            left_s = max(0.0, deadline_s - time.monotonic())
+            publisher.wait_for_all_acked(Duration(seconds=left_s))

@@ -21,7 +21,7 @@ from crash_coach_pkg.coach.strategies.failure import Failure, FailureSettings
 from crash_coach_pkg.coach.strategies.learnability import Learnability, LearnabilitySettings
 from crash_coach_pkg.team import TeamSpec
 
-DRAWS = 100_000
+DRAWS = 20_000
 WHERE = Progress(env_steps=500, total_steps=1000, episodes=50)
 TEAM = TeamSpec(tuple(f"robot_{i + 1}" for i in range(5)))
 Fits = Callable[..., bool]
@@ -77,7 +77,7 @@ def test_learnability_follows_p_times_one_minus_p(fits: Fits) -> None:
     assert fits(observed, np.array(expected) * DRAWS)
     mean = sum(len(who) * count for who, count in chosen.items()) / (3 * DRAWS)
     assert strategy.rate == pytest.approx((sum(arms[1:4]) + 2 * arms[4]) / 3)
-    assert mean == pytest.approx(strategy.rate, abs=0.005)
+    assert mean == pytest.approx(strategy.rate, abs=0.01)
 
 
 def test_failure_follows_the_failures_with_a_floor(fits: Fits) -> None:

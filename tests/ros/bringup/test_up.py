@@ -21,7 +21,7 @@ from crash_coach_interfaces.msg import EpisodeState
 
 from crash_coach_bringup.ros.client import graph_client
 from crash_coach_bringup.ros.graph import GraphError, UpOptions
-from crash_coach_bringup.ros.supervisor import Event
+from crash_coach_bringup.ros.supervisor import STOPS, Event
 from crash_coach_bringup.ros.up import run_up
 from crash_coach_common.strict_yaml import ConfigError
 from crash_coach_pkg.coach.config import CoachConfig
@@ -126,6 +126,8 @@ def test_a_node_that_is_killed_is_told_and_ends_the_graph(
         assert f"{victim} died (killed by SIGKILL, log {tmp_path / victim}.log)" in text
         assert told_s < TOLD_WITHIN_S
         assert running.event()[0] == "stopped"
+        # Nobody waits for what the dead one would acknowledge, until it is killed itself.
+        assert time.monotonic() - killed_s < sum(patience_s for _, patience_s in STOPS[:2])
         assert running.child.wait(20) == 1
         assert running.left() == []
 

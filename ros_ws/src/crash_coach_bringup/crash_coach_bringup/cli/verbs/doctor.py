@@ -114,6 +114,16 @@ def executables() -> Finding:
     return Finding("executables", True, ", ".join(names))
 
 
+def shared_memory() -> Finding:
+    from crash_coach_bringup.ros import probe
+
+    if not (left := probe.half_made(probe.SHARED_MEMORY)):
+        return Finding("shared memory", True, f"nothing half-made in {probe.SHARED_MEMORY}")
+    names = " ".join(map(str, left))
+    hint = f"a node was killed while it made it, and others wait for it without end: rm {names}"
+    return Finding("shared memory", False, names, hint)
+
+
 def dds() -> Finding:
     from crash_coach_bringup.ros.probe import round_trip_ms
 
@@ -131,9 +141,11 @@ def examine() -> list[Finding]:
     findings = [python_version(), compiler(), disk(), threads(), blas_kernels(), caches()]
     findings += [library(name) for name in LIBRARIES]
     findings += [underlay(), interfaces()]
-    need_ros: list[Callable[[], Finding]] = [executables, dds]
+    need_ros: list[Callable[[], Finding]] = [executables, shared_memory]
     if all(finding.ok for finding in findings[-2:]):
         findings += [check() for check in need_ros]
+        if findings[-1].ok:  # or it could wait without end itself
+            findings.append(dds())
     return findings
 
 
