@@ -175,7 +175,7 @@ def test_a_hazard_strikes_at_its_rate_in_every_step(p: float, fits: Callable[...
     """First strikes are geometric, over episodes and robots; and so are those after a recovery."""
     hazard = Trigger(TriggerKind.HAZARD, (p,))
     firsts, pauses = [], []
-    for episode in range(300):
+    for episode in range(150):
         crash = plan(*(Fault(i, "mute", 0, 3, trigger=hazard) for i in range(N)), episode=episode)
         history = follow(crash)
         for place in range(N):

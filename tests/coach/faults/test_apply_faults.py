@@ -46,6 +46,17 @@ def test_bits_of_neighbouring_keys_are_unrelated(axis: int) -> None:
     assert flips == pytest.approx(0.5, abs=0.01)
 
 
+@given(
+    st.integers(0, 2**64 - 1), st.tuples(*3 * [st.integers(-(2**63), 2**63 - 1)]), st.integers(0, 3)
+)
+def test_a_key_on_its_own_has_the_bits_it_has_among_others(
+    seed: int, key: tuple[int, int, int], stream: int
+) -> None:
+    (alone,) = random_bits(seed, *key, stream=stream)
+    counters = [np.array([0, part]) for part in key]
+    assert alone == random_bits(np.uint64(seed), *counters, stream=stream)[1]
+
+
 def test_every_key_counts() -> None:
     base = random_bits(1, 2, 3, 4)
     others = [

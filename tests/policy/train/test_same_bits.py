@@ -16,6 +16,7 @@ from small_run import small
 from policy_pkg.checkpoint import find_checkpoint
 from policy_pkg.kernels import kernels
 from policy_pkg.learner.native import TORCH, VARIABLE, build_name
+from policy_pkg.train.run import train
 
 NO_AVX512 = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
 TRAIN = """
@@ -75,24 +76,22 @@ def test_training_has_the_same_bits_on_other_processors(tmp_path: Path, numba: b
     too in the soak test, since all of them are compiled anew for that."""
     target = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CACHE_DIR": str(tmp_path / "numba")}
     config = small(explore_hold=6, replay_strata="outcome", learner={"td_lambda": 0.8}, n_envs=8)
-    machines = {
-        "this": machine(**{VARIABLE: build_name() or TORCH}),
-        "older": machine(
-            **{VARIABLE: "avx2"},
-            NPY_DISABLE_CPU_FEATURES=disabled(),
-            ATEN_CPU_CAPABILITY="avx2",
-            MKL_CBWR="COMPATIBLE",  # other kernels than this machine's: nothing may go through MKL
-            **(target if numba else {}),
-        ),
-    }
+    older = machine(
+        **{VARIABLE: "avx2"},
+        NPY_DISABLE_CPU_FEATURES=disabled(),
+        ATEN_CPU_CAPABILITY="avx2",
+        MKL_CBWR="COMPATIBLE",  # other kernels than this machine's: nothing may go through MKL
+        **(target if numba else {}),
+    )
+    train(config, tmp_path / "this")
+    run(TRAIN, older, str(tmp_path / "older"), config.model_dump_json())
     found = {}
-    for name, env in machines.items():
-        run(TRAIN, env, str(tmp_path / name), config.model_dump_json())
+    for name, learner in (("this", build_name() or TORCH), ("older", "avx2")):
         agent = find_checkpoint(tmp_path / name) / "agent.safetensors"
         metrics = (tmp_path / name / "metrics.jsonl").read_bytes()
         found[name] = hashlib.sha256(agent.read_bytes() + metrics).hexdigest()
         described = json.loads((tmp_path / name / "run.json").read_text())
-        assert described["kernels"] == {"openblas": "Haswell", "learner": env[VARIABLE]}
+        assert described["kernels"] == {"openblas": "Haswell", "learner": learner}
     assert found["this"] == found["older"]
 
 
