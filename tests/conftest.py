@@ -13,6 +13,7 @@ from shared_memory import remove_left_behind
 from crash_coach_bringup.ros import discovery
 from crash_coach_bringup.ros.domain import reserve_domain
 from crash_coach_common.caches import FOLDERS
+from crash_coach_common.loading import loading
 
 # Where the suite runs in the background of a shell, Ctrl-C is ignored, by all that it starts too.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -32,6 +33,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         path: (i + 0.5) / len(kind) for kind in (waiting, computing) for i, path in enumerate(kind)
     }
     items.sort(key=lambda item: at[item.path])
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    with loading():
+        return (yield)
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:

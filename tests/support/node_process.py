@@ -6,6 +6,7 @@ installed and how it starts, test_executables.py and test_early_signals.py in te
 
 from __future__ import annotations
 
+import gc
 import importlib
 import multiprocessing
 import os
@@ -141,6 +142,7 @@ def _run(
     err: Connection,
 ) -> NoReturn:
     """In the new process: as the script that is installed as ``argv[0]``."""
+    gc.freeze()  # it shares its modules' pages with all others as long as nobody looks through them
     os.setsid()
     begun.close()
     os.dup2(out.fileno(), 1)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crash_coach_common.contract import UserError
+from crash_coach_common.loading import loading
 from policy_pkg.checkpoint import CHECKPOINTS, list_checkpoints
 from policy_pkg.sweep.folder import RunFiles, RunProgress, exclusive, write_progress
 from policy_pkg.sweep.task import Task
@@ -95,7 +96,8 @@ def perform(task: Task) -> None:
         if steps < task.config.total_steps:
             _say(f"process {os.getpid()} trains {task.name} from step {steps}")
             # Imported here: a process that finds nothing to do needs no torch.
-            from policy_pkg.train.run import train
+            with loading():
+                from policy_pkg.train.run import train
 
             train(task.config, files.folder, resume=True, progress=_Told(files.progress))
         drop_replay(files.folder)

@@ -8,6 +8,7 @@ import sys
 from rclpy.node import Node
 
 from crash_coach_common.contract import UserError
+from crash_coach_common.loading import loading
 from crash_coach_common.ros.run_node import run
 from policy_pkg.ros.recorder_node import PROFILE, PROFILE_VARIABLE
 from policy_pkg.ros.trainer.params import TrainerParameters, read_parameters
@@ -39,7 +40,8 @@ def _train(received: list[int]) -> None:
     parameters = _parameters()
     config = load_config(parameters)
     # Only now: it loads torch, which takes longer than finding out what is wrong.
-    from policy_pkg.ros.trainer.trainer import Trainer
+    with loading():
+        from policy_pkg.ros.trainer.trainer import Trainer
 
     Trainer(parameters, config).run(received)
 

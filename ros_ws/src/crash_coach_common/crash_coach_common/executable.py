@@ -9,6 +9,8 @@ import sys
 from types import FrameType
 from typing import NoReturn
 
+from crash_coach_common.loading import loading
+
 
 def command(module: str) -> tuple[str, ...]:
     """What starts ``module`` so, for one without a script of its own."""
@@ -24,7 +26,9 @@ def run(module: str) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
             signal.signal(number, _leave)
-    result: int = importlib.import_module(module).main()
+    with loading():
+        loaded = importlib.import_module(module)
+    result: int = loaded.main()
     return result
 
 

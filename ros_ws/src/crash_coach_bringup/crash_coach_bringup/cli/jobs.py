@@ -19,6 +19,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from crash_coach_bringup.cli import signals
 from crash_coach_bringup.cli.output import console, surroundings
 from crash_coach_common.contract import UserError
+from crash_coach_common.loading import loading
 from crash_coach_common.spawned import hear, start_deaf
 from policy_pkg.checkpoint import CHECKPOINTS, list_checkpoints
 
@@ -56,7 +57,8 @@ def _work(index: int, job: Job, parent: int, out: Queue[Message]) -> None:
     signal.signal(signal.SIGINT, lambda *_: interrupted.set())
     hear()
     # Imported here: only training processes need torch.
-    from policy_pkg.train.run import EndedEarly, train
+    with loading():
+        from policy_pkg.train.run import EndedEarly, train
 
     def report(progress: Any) -> None:
         if os.getppid() != parent:

@@ -17,6 +17,7 @@ from crash_coach_bringup.cli.multi_value import expand
 from crash_coach_bringup.cli.output import surroundings
 from crash_coach_bringup.cli.terminal import degrade_characters
 from crash_coach_common.contract import UserError
+from crash_coach_common.loading import loading
 
 # In the order of --help. A verb's module is loaded where the verb is typed, or nothing known is:
 # no verb should wait for what only others need.
@@ -115,7 +116,8 @@ def main() -> None:
         os.environ.setdefault(name, "1")
     degrade_characters()
     try:
-        app = typed_app(words_typed())  # loads libraries: a signal still ends it at once
+        with loading():  # a signal still ends it at once
+            app = typed_app(words_typed())
         with signals.raised():
             app(args=repeat_options(sys.argv[1:], app))
     except UserError as error:

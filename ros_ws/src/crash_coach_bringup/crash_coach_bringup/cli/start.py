@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from crash_coach_bringup.cli.signals import leave_at_once
+from crash_coach_common.loading import loading
 
 
 def main() -> None:
     leave_at_once()
-    # Imported here: it takes its second.
-    from crash_coach_bringup.cli.main import main as run
+    with loading():  # here: it takes its second
+        from crash_coach_bringup.cli.main import main as run
 
     run()
 

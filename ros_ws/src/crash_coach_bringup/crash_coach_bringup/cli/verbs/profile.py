@@ -14,6 +14,7 @@ from crash_coach_bringup.cli.output import (
     table,
     written_first,
 )
+from crash_coach_common.loading import loading
 from policy_pkg.train.config import TrainConfig, load_train_config
 
 if TYPE_CHECKING:
@@ -166,7 +167,8 @@ def profile(
         raise CliError(f"--seed {' '.join(map(str, seed))}: one run takes one seed")
     settings = load_train_config(config, override or [], seed[0] if seed else None)
     # Imported here: the other verbs do without torch.
-    from policy_pkg.train.profile import profile as measure
+    with loading():
+        from policy_pkg.train.profile import profile as measure
 
     with console.status("starting") as status:
         result = measure(settings, seconds, tell=status.update)

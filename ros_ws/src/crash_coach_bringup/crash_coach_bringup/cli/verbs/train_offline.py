@@ -12,6 +12,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from crash_coach_bringup.cli import signals
 from crash_coach_bringup.cli.jobs import tell_stopped
 from crash_coach_bringup.cli.output import CliError, console
+from crash_coach_common.loading import loading
 from policy_pkg.bags.dataset import load_episodes
 from policy_pkg.bags.problems import Problem
 from policy_pkg.train.offline.config import OfflineConfig, load_offline_config
@@ -104,8 +105,9 @@ def train_runs(
         UserError: as ``policy_pkg.train.offline.run``.
     """
     # Imported here: the other verbs do without torch.
-    from policy_pkg.train.offline import run as offline
-    from policy_pkg.train.run import EndedEarly
+    with loading():
+        from policy_pkg.train.offline import run as offline
+        from policy_pkg.train.run import EndedEarly
 
     columns = (TextColumn("{task.description}"), BarColumn(bar_width=24))
     with Progress(*columns, TextColumn("{task.fields[figures]}"), console=console) as bars:
