@@ -29,7 +29,7 @@ check: setup mlflow environments ## ruff, mypy, the laws of architecture and pac
 	$(IN_ENV) oxlint --quiet --deny-warnings $(PAGE)
 	$(IN_ENV) $(PYTEST) $(SIDE_BY_SIDE) -n 2 -o faulthandler_timeout=1300 $(CHECKED)
 
-test: setup ## the test suite (but for what `make check` runs), about 5 minutes on 2 cores
+test: setup ## the test suite (but for what `make check` runs), about 4 minutes on 2 cores
 	$(IN_ENV) $(PYTEST) $(SIDE_BY_SIDE) -n 4 -o faulthandler_timeout=400 $(CHECKED:%=--ignore=%)
 
 demo: setup ## train two teams, run them as ROS graphs, crash robots, read off the cost
