@@ -81,11 +81,6 @@ class LiveSession(EpisodeSession):
         """Whether they have played it."""
         return bool(self._order.block)
 
-    @property
-    def episodes_waiting(self) -> int:
-        """Episodes that ``advance`` has not come to yet."""
-        return self._episodes.qsize()
-
     def played(self, task: Task, recorded: RecordedEpisode | None) -> None:
         """An episode of ``task``; None: it was lost. From any thread; returns at once.
 
