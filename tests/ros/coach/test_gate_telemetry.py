@@ -70,7 +70,8 @@ def test_changes_are_told_with_step_mode_and_entry(ros_env: dict[str, str]) -> N
             (FaultEvent.ACTIVE, "robot_2", 0, 3, "delay", 0),
             (FaultEvent.CLEARED, "robot_2", 0, 5, "delay", 0),
         ]
-        assert [e.step for e in events(g, FaultEvent.EFFECT)] == [3, 4]
+        # Told once more to a team that asks once more, as it does where the machine is busy.
+        assert {e.step for e in events(g, FaultEvent.EFFECT)} == {3, 4}
 
 
 def test_a_killed_coach_leaves_nothing_of_a_stateful_fault(ros_env: dict[str, str]) -> None:
