@@ -21,14 +21,37 @@ _GONE_S = 60.0
 _YOUNG_S = 60.0  # may be one whose lock is yet to be taken
 
 
+def strike(leader: int) -> set[str]:
+    """SIGKILL to a process group; returns the segments and ports that it had open.
+
+    Not while it makes one: who wants a half-made port waits for it without end, in any domain. And
+    they are made, for one, when a node answers another's end: when a graph is killed.
+    """
+    deadline_s = time.monotonic() + _GONE_S
+    while True:
+        try:
+            os.killpg(leader, signal.SIGSTOP)
+        except ProcessLookupError:  # it ended by itself just now
+            return set()
+        group = _group(leader)
+        while not all(_stands(pid) for pid in group):
+            time.sleep(0.001)
+        opened = {name for pid in group for name in mapped_by(pid) | _opened_by(pid)}
+        if not any(_half_made(name) for name in opened) or time.monotonic() > deadline_s:
+            break
+        os.killpg(leader, signal.SIGCONT)
+        time.sleep(0.001)
+    os.killpg(leader, signal.SIGKILL)
+    return opened
+
+
 def kill_group(child: Child) -> None:
-    """SIGKILL to ``child``'s process group, and what it so left; no-op where it has ended."""
+    """``strike`` on ``child``, and what it so left; no-op where it has ended."""
     if child.poll() is not None:
         return
-    mapped = {name for pid in _group(child.pid) for name in mapped_by(pid)}
-    os.killpg(child.pid, signal.SIGKILL)
+    opened = strike(child.pid)
     child.wait(timeout=_GONE_S)
-    for name in mapped:
+    for name in opened:
         if not _held(FOLDER, name):
             _remove(FOLDER, name)
 
@@ -61,6 +84,37 @@ def mapped_by(pid: int) -> set[str]:
     except (FileNotFoundError, ProcessLookupError):
         return set()
     return {match[1] for match in _MAPPED.finditer(maps)}
+
+
+def _opened_by(pid: int) -> set[str]:
+    """As ``mapped_by``, also what is not mapped yet."""
+    names = set()
+    try:
+        for link in Path(f"/proc/{pid}/fd").iterdir():
+            path = Path(os.readlink(link))
+            if path.parent == FOLDER and _NAME.fullmatch(path.name):
+                names.add(path.name)
+    except (FileNotFoundError, ProcessLookupError):  # of a process that ended, or of a file closed
+        pass
+    return names
+
+
+def _stands(pid: int) -> bool:
+    """It is stopped, or has ended."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+    return state in "TtZX"
+
+
+def _half_made(name: str) -> bool:
+    """Its first word, which says that it is ready, is still 0."""
+    try:
+        with (FOLDER / name).open("rb") as segment:
+            return not any(segment.read(4))
+    except FileNotFoundError:
+        return False
 
 
 def _remove(folder: Path, name: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import signal
 import socket
@@ -18,6 +17,7 @@ from typing import Any
 import psutil
 import pytest
 from crash_coach_interfaces.msg import EpisodeState
+from shared_memory import strike
 
 from crash_coach_bringup.ros.client import graph_client
 from crash_coach_bringup.ros.graph import GraphError, UpOptions
@@ -119,7 +119,7 @@ def test_a_node_that_is_killed_is_told_and_ends_the_graph(
         if victim == "coach":
             await_episode()
         killed_s = time.monotonic()
-        os.kill(running.pids[victim], signal.SIGKILL)
+        strike(running.pids[victim])
         kind, process, text = running.event()
         told_s = time.monotonic() - killed_s
         assert (kind, process) == ("died", victim)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import signal
 import time
 from collections.abc import Callable
 from typing import Any
@@ -12,6 +10,7 @@ from typing import Any
 import pytest
 from coach_graph import ROBOTS, Graph, Team, graph, operator, process, run_to_end, team
 from crash_coach_interfaces.msg import CrashPlan, FaultEvent
+from shared_memory import strike
 
 from crash_coach_pkg.coach.coach import Coach
 from crash_coach_pkg.coach.config import CoachConfig
@@ -268,7 +267,7 @@ def test_a_coach_that_starts_in_mid_episode_plans_it(ros_env: dict[str, str]) ->
         with process(ros_env, "coach", robots=ROBOTS, victims=("robot_1",)) as child:
             t.until(lambda: FaultEvent.ARMED in t.kinds(), "the new coach's plan armed")
             assert t.step(0, 4)[0].faulted
-            os.killpg(child.pid, signal.SIGKILL)
+            strike(child.pid)
 
 
 @pytest.mark.parametrize(

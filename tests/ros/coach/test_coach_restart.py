@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import time
 from typing import Any
 
 import numpy as np
 from coach_graph import ROBOTS, Team, graph, operator, process, run_to_end, team
 from crash_coach_interfaces.msg import Action, CrashPlan, Fault, FaultEvent
+from shared_memory import strike
 
 from crash_coach_pkg.coach.coach import Coach
 from crash_coach_pkg.coach.config import CoachConfig
@@ -72,7 +71,7 @@ def test_a_killed_coach_that_is_back_within_the_lease_goes_on_without_a_jump(
         half = STEPS // 2
         assert played(g.team, range(half)) == expected[:half]
         first = g.team.plans[-1]
-        os.killpg(g.coach.pid, signal.SIGKILL)
+        strike(g.coach.pid)
         g.coach.wait(timeout=10)
         # Its own settings, which count from the next episode on: robot_2 is mute.
         with process(ros_env, "coach", robots=ROBOTS, lease_s=20.0, victims=("robot_2",)):

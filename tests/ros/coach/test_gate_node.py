@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import signal
 import time
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from coach_graph import ROBOTS, WAIT_S, graph, process, run_to_end, team
 from crash_coach_interfaces.msg import Action, FaultEvent
+from shared_memory import strike
 
 from crash_coach_common.keyed_random import random_bits
 from crash_coach_pkg.faults.batch_faults import random_available
@@ -70,7 +70,7 @@ def test_a_killed_coach_leaves_no_fault_behind(ros_env: dict[str, str]) -> None:
     with graph(ros_env, victims=("robot_1",), lease_s=lease_s) as g:
         for step in range(20):
             assert g.team.step(0, step)[0].faulted
-        os.killpg(g.coach.pid, signal.SIGKILL)
+        strike(g.coach.pid)
         killed_s, step = time.monotonic(), 20
         begun_s = killed_s
         while g.team.step(0, step)[0].faulted:

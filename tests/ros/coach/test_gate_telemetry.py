@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import time
 from array import array
 from collections.abc import Callable
@@ -15,6 +13,7 @@ from crash_coach_interfaces.msg import Action, CrashPlan, Fault, FaultEvent, Obs
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
+from shared_memory import strike
 
 FREEZE_1 = {"victims": ("robot_1",), "crash_mode": "freeze", "start_step": 2}
 
@@ -85,7 +84,7 @@ def test_a_killed_coach_leaves_nothing_of_a_stateful_fault(ros_env: dict[str, st
             assert outcomes[0].command.fault == (3 if step >= 2 else 0)
         g.team.until(lambda: bool(listener.in_force), "the plan in force")
         assert [f.mode for f in listener.in_force[-1].faults] == ["freeze"]
-        os.killpg(g.coach.pid, signal.SIGKILL)
+        strike(g.coach.pid)
         g.team.until(lambda: bool(events(g, FaultEvent.EXPIRED)), "EXPIRED")
         g.team.until(lambda: not listener.in_force[-1].faults, "the empty plan")
         for key in [(0, 6), (0, 7), (1, 0), (1, 1)]:

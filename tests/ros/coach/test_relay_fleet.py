@@ -23,6 +23,7 @@ from geometry_msgs.msg import Twist, TwistStamped
 from kept_running import kept_running
 from node_process import Child
 from rclpy.serialization import deserialize_message, serialize_message
+from shared_memory import strike
 
 from crash_coach_bringup.ros import discovery
 from crash_coach_bringup.ros.domain import reserve_domain
@@ -242,7 +243,7 @@ def test_a_killed_coach_leaves_no_fault_behind(fleet: Fleet) -> None:
     d = fleet.drivers
     fleet.fault("delay", steps=10)
     start_s = time.monotonic()
-    fleet.coach.kill()
+    strike(fleet.coach.pid)
     d.until(lambda: d.events[-1].kind == FaultEvent.EXPIRED, "the end of the lease")
     assert time.monotonic() - start_s < LEASE_S + 1.0
     fleet.drives_as_before()

@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from shared_memory import FOLDER, kill_group, mapped_by, remove_left_behind
+from shared_memory import FOLDER, kill_group, mapped_by, remove_left_behind, strike
 
 NODE = """
 import sys, rclpy
@@ -55,3 +55,29 @@ def test_a_group_that_is_killed_leaves_nothing(ros_env: dict[str, str]) -> None:
         kill_group(it)
     assert {name for name in mapped if "port" not in name}
     assert not mapped & {path.name for path in FOLDER.iterdir()}
+
+
+MAKER = """
+import os, sys, time
+path = sys.argv[1]
+made = os.open(path, os.O_CREAT | os.O_RDWR)
+os.truncate(made, 64)
+print("up", flush=True)
+time.sleep(float(sys.argv[2]))
+os.pwrite(made, b"\\2", 0)
+time.sleep(60)
+"""
+
+
+@pytest.mark.skipif(not FOLDER.is_dir(), reason=f"no {FOLDER} here")
+def test_nobody_is_killed_who_makes_a_port() -> None:
+    port = FOLDER / "fastrtps_port1"  # of no domain
+    command = [sys.executable, "-c", MAKER, str(port), "0.5"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True) as it:
+        assert it.stdout is not None
+        assert it.stdout.readline() == b"up\n"
+        assert strike(it.pid) == {port.name}
+    try:
+        assert port.read_bytes()[0] == 2
+    finally:
+        port.unlink()
