@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,20 +29,19 @@ def strike(leader: int) -> set[str]:
     they are made, for one, when a node answers another's end: when a graph is killed.
     """
     deadline_s = time.monotonic() + _GONE_S
-    while True:
-        try:
+    opened: set[str] = set()
+    with suppress(ProcessLookupError):  # it ended just now, by itself or struck before
+        while True:
             os.killpg(leader, signal.SIGSTOP)
-        except ProcessLookupError:  # it ended by itself just now
-            return set()
-        group = _group(leader)
-        while not all(_stands(pid) for pid in group):
+            group = _group(leader)
+            while not all(_stands(pid) for pid in group):
+                time.sleep(0.001)
+            opened = {name for pid in group for name in mapped_by(pid) | _opened_by(pid)}
+            if not any(_half_made(name) for name in opened) or time.monotonic() > deadline_s:
+                break
+            os.killpg(leader, signal.SIGCONT)
             time.sleep(0.001)
-        opened = {name for pid in group for name in mapped_by(pid) | _opened_by(pid)}
-        if not any(_half_made(name) for name in opened) or time.monotonic() > deadline_s:
-            break
-        os.killpg(leader, signal.SIGCONT)
-        time.sleep(0.001)
-    os.killpg(leader, signal.SIGKILL)
+        os.killpg(leader, signal.SIGKILL)
     return opened
 
 
