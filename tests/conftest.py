@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -19,6 +20,8 @@ from crash_coach_common.loading import loading
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+WAITING = [Path(__file__).parent / room for room in ("ros", "console")]
+
 # How long an example takes says how busy the machine is.
 settings.register_profile("here", deadline=None)
 settings.load_profile("here")
@@ -27,7 +30,7 @@ settings.load_profile("here")
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files that mostly wait, for graphs and pages, spread between files that compute."""
     files = list(dict.fromkeys(item.path for item in items))
-    waiting = [path for path in files if {"ros", "console"} & set(path.parts)]
+    waiting = [path for path in files if any(map(path.is_relative_to, WAITING))]
     computing = [path for path in files if path not in waiting]
     at = {path: i / len(computing) for i, path in enumerate(computing)}
     # A bit ahead: nobody should wait at the end.

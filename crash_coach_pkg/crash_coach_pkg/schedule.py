@@ -6,7 +6,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from crash_coach_common.contract import FloatArray
-from crash_coach_common.keyed_random import random_bits
+from crash_coach_common.keyed_random import bits_of_one
 from crash_coach_pkg.plan import CrashPlan, Fault, TriggerKind
 
 _HAZARD_STREAM = 1000  # + the fault's place in the plan
@@ -120,7 +120,7 @@ class Schedule:
 @lru_cache(maxsize=4096)
 def _uniform(seed: int, episode: int, step: int, robot: int, stream: int) -> float:
     """In [0, 1). Kept, because a gate follows the schedule once for each robot of the team."""
-    return (int(random_bits(seed, episode, step, robot, stream)[0]) >> 11) * 2.0**-53
+    return (bits_of_one(seed, episode, step, robot, stream) >> 11) * 2.0**-53
 
 
 def _overlaps(other: Fault, fault: Fault, step: int) -> bool:

@@ -13,10 +13,10 @@ from in_process import refused, typed
 from crash_coach_bringup.cli.main import repeat_options
 from crash_coach_bringup.cli.options import conditions, mode_parameters, timed
 from crash_coach_bringup.cli.output import CliError, check_json_target, write_json
-from crash_coach_bringup.cli.verbs.doctor import shared_memory
+from crash_coach_bringup.cli.verbs import doctor
 from crash_coach_bringup.cli.verbs.train import plan_jobs
-from crash_coach_bringup.ros import probe
 from crash_coach_bringup.ros.probe import find_executable
+from crash_coach_bringup.ros.shared_memory import half_made
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 
@@ -279,7 +279,7 @@ def test_doctor_finds_this_machine_fit(ros_env: dict[str, str], tmp_path: Path) 
 def test_doctor_names_a_segment_that_a_killed_node_left_half_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(probe, "SHARED_MEMORY", tmp_path)
+    monkeypatch.setattr(doctor, "SHARED_MEMORY", tmp_path)
     contents = {
         "fastrtps_port7011": bytes(8),
         "fastrtps_port7012": b"\2" + bytes(7),
@@ -289,12 +289,12 @@ def test_doctor_names_a_segment_that_a_killed_node_left_half_made(
     }
     for name, content in contents.items():
         (tmp_path / name).write_bytes(content)
-    assert probe.half_made(tmp_path) == []  # they may be about to be made
+    assert half_made(tmp_path) == []  # they may be about to be made
     for name in contents:
         os.utime(tmp_path / name, (0, 0))
     left = [tmp_path / "fastrtps_0123456789abcdef", tmp_path / "fastrtps_port7011"]
-    assert probe.half_made(tmp_path) == left
-    finding = shared_memory()
+    assert half_made(tmp_path) == left
+    finding = doctor.shared_memory()
     assert not finding.ok
     assert f"rm {left[0]} {left[1]}" in finding.hint
 

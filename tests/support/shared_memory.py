@@ -11,12 +11,16 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import psutil
+
+from crash_coach_bringup.ros.shared_memory import NAME, is_ready
+from crash_coach_bringup.ros.shared_memory import SHARED_MEMORY as FOLDER
+
 if TYPE_CHECKING:
     from node_process import Child
 
-FOLDER = Path("/dev/shm")
-_NAME = re.compile(r"fastrtps_(port\d+|[0-9a-f]{16})")
-_MAPPED = re.compile(rf"{FOLDER}/({_NAME.pattern})$", re.MULTILINE)
+_MAPPED = re.compile(rf"{FOLDER}/({NAME.pattern})$", re.MULTILINE)
+_STANDING = (psutil.STATUS_STOPPED, psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
 _LOCKS = ("_el", "_sl")  # held while a process uses it
 _GONE_S = 60.0
 _YOUNG_S = 60.0  # may be one whose lock is yet to be taken
@@ -34,10 +38,10 @@ def strike(leader: int) -> set[str]:
         while True:
             os.killpg(leader, signal.SIGSTOP)
             group = _group(leader)
-            while not all(_stands(pid) for pid in group):
+            while not all(map(_stands, group)) and time.monotonic() < deadline_s:
                 time.sleep(0.001)
             opened = {name for pid in group for name in mapped_by(pid) | _opened_by(pid)}
-            if not any(_half_made(name) for name in opened) or time.monotonic() > deadline_s:
+            if not any(_in_the_making(name) for name in opened) or time.monotonic() > deadline_s:
                 break
             os.killpg(leader, signal.SIGCONT)
             time.sleep(0.001)
@@ -58,7 +62,7 @@ def kill_group(child: Child) -> None:
 
 def remove_left_behind(folder: Path = FOLDER) -> list[str]:
     """Removes the segments and ports that no process holds; returns their names."""
-    names = [path.name for path in folder.glob("fastrtps_*") if _NAME.fullmatch(path.name)]
+    names = [path.name for path in folder.glob("fastrtps_*") if NAME.fullmatch(path.name)]
     left = sorted(name for name in names if _left(folder, name))
     for name in left:
         _remove(folder, name)
@@ -88,31 +92,24 @@ def mapped_by(pid: int) -> set[str]:
 
 def _opened_by(pid: int) -> set[str]:
     """As ``mapped_by``, also what is not mapped yet."""
-    names = set()
     try:
-        for link in Path(f"/proc/{pid}/fd").iterdir():
-            path = Path(os.readlink(link))
-            if path.parent == FOLDER and _NAME.fullmatch(path.name):
-                names.add(path.name)
-    except (FileNotFoundError, ProcessLookupError):  # of a process that ended, or of a file closed
-        pass
-    return names
+        opened = [Path(file.path) for file in psutil.Process(pid).open_files()]
+    except psutil.NoSuchProcess:
+        return set()
+    return {path.name for path in opened if path.parent == FOLDER and NAME.fullmatch(path.name)}
 
 
 def _stands(pid: int) -> bool:
     """It is stopped, or has ended."""
     try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except (FileNotFoundError, ProcessLookupError):
+        return psutil.Process(pid).status() in _STANDING
+    except psutil.NoSuchProcess:
         return True
-    return state in "TtZX"
 
 
-def _half_made(name: str) -> bool:
-    """Its first word, which says that it is ready, is still 0."""
+def _in_the_making(name: str) -> bool:
     try:
-        with (FOLDER / name).open("rb") as segment:
-            return not any(segment.read(4))
+        return not is_ready(FOLDER / name)
     except FileNotFoundError:
         return False
 

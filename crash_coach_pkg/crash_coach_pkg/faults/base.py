@@ -18,7 +18,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict
 
 from crash_coach_common.contract import FloatArray
-from crash_coach_common.keyed_random import random_bits
+from crash_coach_common.keyed_random import bits_of_one
 
 C = TypeVar("C")
 Vector = npt.NDArray[np.float64]
@@ -50,7 +50,7 @@ class Step:
 
         Streams 0..99 are the built-in modes', 100..999 free for others, from 1000 the schedule's.
         """
-        return int(random_bits(self.seed, self.episode, self.step, self.robot, stream)[0])
+        return bits_of_one(self.seed, self.episode, self.step, self.robot, stream)
 
     def uniform(self, stream: int) -> float:
         """In [0, 1), as ``bits``."""

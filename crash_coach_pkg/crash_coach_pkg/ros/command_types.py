@@ -18,7 +18,7 @@ from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.serialization import deserialize_message, serialize_message
 
 from crash_coach_common.contract import UserError
-from crash_coach_common.keyed_random import random_bits
+from crash_coach_common.keyed_random import bits_of_one
 from crash_coach_pkg.faults.base import Need, Vector
 
 _LINEAR_X, _LINEAR_Y, _ANGULAR_Z = 0, 1, 5  # places in a vector
@@ -85,7 +85,7 @@ class TwistTools(OpaqueTools):
         vector = np.zeros(_VELOCITIES)
         limits = self._limits.vector()
         for place in (_LINEAR_X, _LINEAR_Y, _ANGULAR_Z):
-            uniform = (int(random_bits(bits, 0, 0, place)[0]) >> 11) * 2.0**-53
+            uniform = (bits_of_one(bits, 0, 0, place) >> 11) * 2.0**-53
             vector[place] = (2.0 * uniform - 1.0) * limits[place]
         return self._made(self._command, vector)
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crash_coach_common.keyed_random import UInt64Array, random_bits
+from crash_coach_common.keyed_random import UInt64Array, bits_of_one, random_bits
 from crash_coach_pkg.faults.batch_faults import (
     MUTE_CODE,
     RANDOM_CODE,
@@ -52,7 +52,7 @@ def test_bits_of_neighbouring_keys_are_unrelated(axis: int) -> None:
 def test_a_key_on_its_own_has_the_bits_it_has_among_others(
     seed: int, key: tuple[int, int, int], stream: int
 ) -> None:
-    (alone,) = random_bits(seed, *key, stream=stream)
+    alone = bits_of_one(seed, *key, stream=stream)
     counters = [np.array([0, part]) for part in key]
     assert alone == random_bits(np.uint64(seed), *counters, stream=stream)[1]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import time
 from pathlib import Path
 
@@ -22,30 +21,6 @@ EXECUTABLES = {
     "crash_coach_pkg": ("coach", "gate"),
     "crash_coach_bringup": ("crash-coach",),
 }
-
-SHARED_MEMORY = Path("/dev/shm")
-_OF_FAST_DDS = re.compile(r"fastrtps_(port\d+|[0-9a-f]{16})")
-_MADE_WITHIN_S = 2.0
-
-
-def half_made(folder: Path) -> list[Path]:
-    """Segments of Fast DDS whose maker was killed before they were ready, sorted.
-
-    Fast DDS waits without end, in every domain, for one whose first word stays 0.
-    """
-    found = []
-    for path in sorted(folder.glob("fastrtps_*")):
-        if not _OF_FAST_DDS.fullmatch(path.name):
-            continue
-        try:
-            age_s = time.time() - path.stat().st_mtime
-            with path.open("rb") as segment:
-                ready = any(segment.read(4))
-        except (FileNotFoundError, PermissionError):  # removed meanwhile; another user's
-            continue
-        if not ready and age_s > _MADE_WITHIN_S:
-            found.append(path)
-    return found
 
 
 def find_executable(package: str, name: str) -> Path:

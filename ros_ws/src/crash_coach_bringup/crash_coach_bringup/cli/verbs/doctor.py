@@ -15,6 +15,7 @@ from typing import Annotated
 import typer
 
 from crash_coach_bringup.cli.output import check_json_target, console, table, written_first
+from crash_coach_bringup.ros.shared_memory import SHARED_MEMORY, half_made
 from crash_coach_common.caches import places
 from policy_pkg.kernels import SAME_EVERYWHERE, kernels
 
@@ -115,10 +116,8 @@ def executables() -> Finding:
 
 
 def shared_memory() -> Finding:
-    from crash_coach_bringup.ros import probe
-
-    if not (left := probe.half_made(probe.SHARED_MEMORY)):
-        return Finding("shared memory", True, f"nothing half-made in {probe.SHARED_MEMORY}")
+    if not (left := half_made(SHARED_MEMORY)):
+        return Finding("shared memory", True, f"nothing half-made in {SHARED_MEMORY}")
     names = " ".join(map(str, left))
     hint = f"a node was killed while it made it, and others wait for it without end: rm {names}"
     return Finding("shared memory", False, names, hint)
