@@ -14,6 +14,11 @@ from crash_coach_pkg.coach.strategies.base import Progress
 from crash_coach_pkg.plan import NEXT_STEP, CrashPlan, Planner
 from crash_coach_pkg.team import TeamSpec
 
+AHEAD = 1000
+"""Revisions left free above another coach's when this one takes over. The other goes on counting
+from where it is: were the next number taken, both would soon publish the same one, and each would
+take the other's plan for its own."""
+
 
 class ControlSettings(BaseModel):
     """Settings of a coach in a live graph."""
@@ -119,7 +124,7 @@ class Control:
         """
         if self._plan is not None or plan.revision == 0:
             return None
-        self._first_revision = self._revision = max(self._revision, plan.revision)
+        self._count_above(plan.revision)
         self._ended = False
         self._finished = plan.episode
         if self._scenario is None:
@@ -202,15 +207,18 @@ class Control:
         return self._revise(before)
 
     def published(self, revision: int) -> bool:
-        """Whether a plan with this revision came from here."""
+        """Whether a plan with this revision came from here, since this coach last took over."""
         return self._first_revision < revision <= self._revision
 
     def overtake(self, revision: int) -> CrashPlan | None:
         """Another coach's revision was seen in force; returns a plan above it, if need be."""
         if self._plan is None or revision <= self._plan.revision:
             return None
-        self._revision = max(self._revision, revision)
+        self._count_above(revision)
         return self._revise(self._plan)
+
+    def _count_above(self, revision: int) -> None:
+        self._first_revision = self._revision = max(self._revision, revision + AHEAD)
 
     def _progress(self) -> Progress:
         return Progress(env_steps=0, total_steps=0, episodes=self._finished)

@@ -7,6 +7,7 @@ own, because a change with ``apply_at: next_step`` waits there for the gate's an
 
 from __future__ import annotations
 
+import random
 import sys
 import threading
 import time
@@ -39,7 +40,7 @@ from crash_coach_pkg.coach.fault_scenario import (
     find_fault_scenario,
     load_fault_scenario,
 )
-from crash_coach_pkg.coach.live_coach import Control, ControlSettings
+from crash_coach_pkg.coach.live_coach import AHEAD, Control, ControlSettings
 from crash_coach_pkg.coach.parameters import (
     START_SPECS,
     ParameterSpec,
@@ -81,9 +82,10 @@ class CoachNode(QosNode):
         self._endless = not start["follow_sim"]
         settings = build_settings(self._values, self._team)
         planner = scenario_planner(self._scenario, self._team, settings)
-        # Seconds grow over restarts, so that a new coach's first plan is newer than the last one
-        # of the coach before it.
-        control = Control(settings, self._team, int(time.time()), planner)
+        # Seconds grow over restarts, so that a new coach's plans are newer than those before it,
+        # and two that start in the same second do not number alike. ``adopt`` sees to the rest.
+        revision = int(time.time()) + random.randrange(AHEAD)
+        control = Control(settings, self._team, revision, planner)
         self.link = CoachLink(self, control, robots, not self._endless, self._check_thread)
         self._stop = threading.Event()
         self._threads = ThreadPoolExecutor(1, thread_name_prefix="coach parameters")

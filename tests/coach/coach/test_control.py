@@ -6,10 +6,12 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from crash_coach_common.contract import UserError
 from crash_coach_pkg.coach.config import CoachConfig
-from crash_coach_pkg.coach.live_coach import Control, ControlSettings
+from crash_coach_pkg.coach.live_coach import AHEAD, Control, ControlSettings
 from crash_coach_pkg.coach.parameters import build_settings, parameter_specs
 from crash_coach_pkg.plan import NEXT_STEP, CrashPlan, Fault
 from crash_coach_pkg.team import TeamSpec, check_robots
@@ -161,7 +163,32 @@ def test_a_plan_of_another_coach_is_overtaken() -> None:
     assert coach.overtake(plan.revision) is None
     over = coach.overtake(50)
     assert over is not None
-    assert (over.revision, over.faults) == (51, plan.faults)
+    assert (over.revision, over.faults) == (50 + AHEAD + 1, plan.faults)
+
+
+@given(st.integers(1, 20), st.lists(st.integers(0, 1), max_size=30), st.booleans())
+def test_two_coaches_never_number_alike(before: int, changes: list[int], told: bool) -> None:
+    """The second takes over, from the gate's plan or from an event, while the first goes on."""
+    first, second = control(revision=100), control(revision=100 - before)
+    in_force = first.follow(0)
+    assert in_force is not None
+    for _ in range(before):
+        in_force = first.configure(settings(), now=True) or in_force
+    if told:
+        taken = second.adopt(in_force)
+    else:
+        second.follow(0)
+        taken = second.overtake(in_force.revision)
+    assert taken is not None
+    ours, theirs = {taken.revision}, {in_force.revision}
+    for who in changes:
+        plan = (first, second)[who].configure(settings(), now=True)
+        assert plan is not None
+        (theirs, ours)[who].add(plan.revision)
+    assert min(ours) > max(theirs)  # the newer coach's plans are those in force
+    assert all(second.published(revision) for revision in ours)
+    assert not any(second.published(revision) for revision in theirs)
+    assert not any(first.published(revision) for revision in ours)
 
 
 def test_a_fault_that_runs_does_not_begin_anew_with_a_later_revision() -> None:
@@ -189,15 +216,15 @@ def test_a_new_coach_takes_over_plan_and_rate_and_plans_the_next_episode_itself(
     coach = control(revision=10, strategy="adaptive", adaptive={"rho": 0.5}, block_episodes=1)
     plan = coach.adopt(left())
     assert plan is not None
-    assert plan == replace(left(), revision=901)
+    assert plan == replace(left(), revision=900 + AHEAD + 1)
     assert (coach.rate, coach.plan) == (0.25, plan)
     assert coach.follow(4) is None
     assert not coach.published(900)
-    assert coach.published(901)
+    assert coach.published(900 + AHEAD + 1)
     coach.finish(True)  # the episode counts, however it began
     following = coach.follow(5)
     assert following is not None
-    assert (following.revision, following.rate) == (902, 0.625)
+    assert (following.revision, following.rate) == (900 + AHEAD + 2, 0.625)
     assert coach.adopt(left(revision=2000)) is None
 
 
@@ -214,7 +241,7 @@ def test_the_episode_may_have_changed_since() -> None:
     coach.adopt(left(episode=4))
     plan = coach.follow(6)
     assert plan is not None
-    assert ([fault.robot for fault in plan.faults], plan.revision) == ([2], 902)
+    assert ([fault.robot for fault in plan.faults], plan.revision) == ([2], 900 + AHEAD + 2)
 
 
 def test_a_curriculum_goes_on_from_the_episodes_number() -> None:
