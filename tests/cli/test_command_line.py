@@ -303,5 +303,5 @@ def test_doctor_names_what_is_missing(tmp_path: Path) -> None:
     broken = {**os.environ, "AMENT_PREFIX_PATH": str(tmp_path)}
     done = crash_coach("doctor", env=broken)
     assert done.returncode == 1
-    assert "MISSING" in done.stdout
+    assert "PROBLEM" in done.stdout
     assert "make setup" in done.stdout

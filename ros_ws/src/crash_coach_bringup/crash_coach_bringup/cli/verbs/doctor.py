@@ -151,12 +151,12 @@ def examine() -> list[Finding]:
 def doctor(
     json: Annotated[Path | None, typer.Option(help="Also write the findings to this file.")] = None,
 ) -> None:
-    """Tells what was found on this machine and what is missing. Exit code 1 if anything is."""
+    """Tells what was found on this machine and what is missing or in the way; then exit code 1."""
     check_json_target(json)
     findings = examine()
     rows = table("crash-coach doctor", ["check", "", "found", "what to do"])
     for row in findings:
-        mark = "[green]ok[/green]" if row.ok else "[red]MISSING[/red]"
+        mark = "[green]ok[/green]" if row.ok else "[red]PROBLEM[/red]"
         rows.add_row(row.check, mark, row.found, row.hint)
     with written_first(json, {"findings": [asdict(row) for row in findings]}):
         console.print(rows)
