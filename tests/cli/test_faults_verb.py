@@ -238,7 +238,7 @@ def test_a_report_takes_the_place_of_nothing_else(tmp_path: Path) -> None:
     (mine / "thesis.tex").write_text("x")
     assert "holds 'thesis.tex'" in refused("run", file, *QUICK, "--out", str(mine))
     assert "is not a folder" in refused("run", file, *QUICK, "--out", file)
-    assert "there is no folder" in refused("run", file, *QUICK, "--out", str(tmp_path / "a" / "b"))
+    assert "is not a folder" in refused("run", file, *QUICK, "--out", f"{file}/b")
     # The folder that takes its place at the end has a longer name, and cannot be made.
     before = sorted(tmp_path.rglob("*"))
     long = tmp_path / ("n" * 250)

@@ -18,7 +18,7 @@ from in_process import typed
 from crash_coach_bringup.cli.output import CliError, check_file_target, written_first
 from crash_coach_bringup.cli.terminal import PLAIN, degrade_characters
 from crash_coach_common import whole_output
-from crash_coach_common.whole_output import kind_of, write_whole
+from crash_coach_common.whole_output import folder_made, kind_of, write_whole
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 
@@ -63,6 +63,23 @@ def test_a_pipe_without_a_reader_is_an_error_after_a_while(
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(OSError, match="nobody reads from it"):
         write_whole(tmp_path / "pipe", b"x")
+
+
+def test_missing_folders_are_made_and_go_again_where_nothing_comes_of_it(
+    tmp_path: Path, team: Path
+) -> None:
+    out = tmp_path / "a" / "b" / "picture.png"
+    assert typed("render", str(team), "--out", str(out)).returncode == 0
+    assert out.read_bytes()[:4] == b"\x89PNG"
+    with pytest.raises(KeyError), folder_made(tmp_path / "a" / "c" / "d"):
+        raise KeyError
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["b"]
+    report = tmp_path / "new" / "report"
+    run = ("faults", "run", "one_mute", "--policy", str(team), "--episodes", "2")
+    assert typed(*run, "--out", str(report)).returncode == 1  # an untrained team
+    assert (report / "report.md").is_file()
+    refused = typed(*run, "--out", str(out / "report"))
+    assert "picture.png is not a folder" in refused.stderr
 
 
 def test_a_link_is_followed_and_the_file_keeps_its_permissions(tmp_path: Path) -> None:

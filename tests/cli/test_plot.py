@@ -273,8 +273,9 @@ def test_writes_both_pictures_and_the_figures(
 
 def test_out(tmp_path: Path) -> None:
     assert targets(tmp_path / "a.png") == targets(tmp_path / "a")
-    with pytest.raises(CliError, match="there is no folder"):
-        targets(tmp_path / "missing" / "a")
+    (tmp_path / "file").touch()
+    with pytest.raises(CliError, match="file is not a folder"):
+        targets(tmp_path / "file" / "missing" / "a")
     (tmp_path / "b.svg").mkdir()
     with pytest.raises(CliError, match=r"b\.svg: is a directory"):
         targets(tmp_path / "b")

@@ -77,9 +77,10 @@ def test_the_verb_writes_what_it_prints(tmp_path: Path) -> None:
 
 
 def test_bad_input_is_named(tmp_path: Path) -> None:
+    (tmp_path / "no").touch()
     nowhere = command("buttons/qmix", "--json", str(tmp_path / "no" / "x.json"))
     assert isinstance(nowhere.exception, CliError)
-    assert "there is no folder" in str(nowhere.exception)
+    assert "no is not a folder" in str(nowhere.exception)
     assert "unknown key 'n_env'" in str(command("buttons/qmix", "--set", "n_env=4").exception)
     assert "--seed 1 2" in str(command("buttons/qmix", "--seed", "1", "2").exception)
     assert command("buttons/qmix", "--seconds", "0").exit_code == 2

@@ -119,7 +119,7 @@ def test_a_recording_of_an_unknown_scenario_is_named(tmp_path: Path, here: Here)
     ("arguments", "names"),
     [
         (("--out", "x.avi"), "x.avi: a file ending in .mp4, .gif, .png"),
-        (("--out", "/no/where/x.png"), "no folder /no/where"),
+        (("--out", "/dev/null/where/x.png"), "/dev/null is not a folder"),
         (("--out", "x.png", "--speed", "0"), "--speed 0.0"),
         (("--out", "x.png", "--episode", str(10**20)), "--episode"),
         (("--out", "x.png", "--json", "."), "--json .: is a directory"),

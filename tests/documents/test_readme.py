@@ -101,13 +101,24 @@ def env() -> Iterator[dict[str, str]]:
         yield out
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory, env: dict[str, str]) -> Path:
-    """A checkout of links in which `make demo` was typed."""
-    path = tmp_path_factory.mktemp("checkout")
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """Of links, in which nothing was typed but `make setup`."""
+    return checkout_of_links(tmp_path / "checkout")
+
+
+def checkout_of_links(path: Path) -> Path:
+    path.mkdir()
     for entry in ROOT.iterdir():
         if entry.name not in ("runs", ".git"):
             (path / entry.name).symlink_to(entry)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, env: dict[str, str]) -> Path:
+    """A checkout in which `make demo` was typed."""
+    path = checkout_of_links(tmp_path_factory.mktemp("demo") / "checkout")
     # 2,000 steps teach nothing, and the demo has to say so: make's own exit code is then 2.
     output = typed(path, block("make demo")[:1], env, code=2)
     assert "The coached team FAILED: crash-free" in output
@@ -185,16 +196,16 @@ def test_param_set(folder: Path, env: dict[str, str], start: str) -> None:
         crash_and_clear(folder, [". ./env.sh", *commands], env)
 
 
-def test_train_and_evaluate(folder: Path, env: dict[str, str]) -> None:
-    output = typed(folder, [". ./env.sh", *block("crash-coach doctor")], env)
+def test_train_and_evaluate(checkout: Path, env: dict[str, str]) -> None:
+    output = typed(checkout, [". ./env.sh", *block("crash-coach doctor")], env)
     evaluations = [line for line in block("crash-coach doctor") if " evaluate " in line]
     assert output.count("trajectory hash") == len(evaluations) == 3
-    assert (folder / "runs" / "mine.json").exists()
+    assert (checkout / "runs" / "mine.json").exists()
 
 
-def test_trained_teams_are_there(folder: Path, env: dict[str, str]) -> None:
+def test_trained_teams_are_there(checkout: Path, env: dict[str, str]) -> None:
     (teams,) = [lines for lines in blocks() if " results/" in lines[0]]
-    output = typed(folder, [". ./env.sh", *teams], env)
+    output = typed(checkout, [". ./env.sh", *teams], env)
     assert "wrote runs/3m.mp4" in output
     assert "wrote runs/exported/policy.onnx" in output
 

@@ -1,6 +1,7 @@
 """Outputs onto any kind of path: plain files whole or not at all, the others written to.
 
 A symbolic link is followed. What is no plain file, such as a pipe or a terminal, is never replaced.
+Folders that are missing on the way are made.
 """
 
 from __future__ import annotations
@@ -37,11 +38,31 @@ def check_output(path: Path) -> None:
     kind, target = _look(path)
     if kind != "file" or _standard_stream(target) is not None:
         return
-    folder = target.parent
+    check_folder(target.parent, path)
+
+
+def check_folder(folder: Path, path: Path) -> None:
+    """Raises OSError about ``path`` where nothing can be put into ``folder``, there or to be made."""
+    while not os.path.lexists(folder):
+        folder = folder.parent
     if not folder.is_dir():
-        raise OSError(errno.ENOENT, f"there is no folder {folder}", str(path))
+        raise OSError(errno.ENOTDIR, f"{folder} is not a folder", str(path))
     if not os.access(folder, os.W_OK | os.X_OK):
         raise OSError(errno.EACCES, f"the folder {folder} cannot be written to", str(path))
+
+
+@contextmanager
+def folder_made(folder: Path) -> Iterator[None]:
+    """``folder`` is there for the body; what had to be made goes again where the body fails."""
+    missing = [each for each in (folder, *folder.parents) if not os.path.lexists(each)]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
+    except BaseException:
+        for each in missing:
+            with suppress(OSError):
+                each.rmdir()
+        raise
 
 
 @contextmanager
@@ -55,15 +76,16 @@ def whole_output(path: Path) -> Iterator[Path]:
     stream = _standard_stream(target) if kind == "file" else None
     if kind == "file" and stream is None:
         temporary = target.with_name(f".{os.getpid()}.{next(_NUMBERS)}{target.suffix}")
-        try:
-            yield temporary
-            with suppress(FileNotFoundError):
-                temporary.chmod(stat.S_IMODE(target.stat().st_mode))
-            temporary.replace(target)
-        finally:
-            # On a disk that is read-only this fails too, and says less than what went wrong first.
-            with suppress(OSError):
-                temporary.unlink()
+        with folder_made(target.parent):
+            try:
+                yield temporary
+                with suppress(FileNotFoundError):
+                    temporary.chmod(stat.S_IMODE(target.stat().st_mode))
+                temporary.replace(target)
+            finally:
+                # On a read-only disk this fails too, and says less than what went wrong first.
+                with suppress(OSError):
+                    temporary.unlink()
         return
     with tempfile.TemporaryDirectory(prefix="crash_coach_") as folder:
         temporary = Path(folder) / f"output{path.suffix}"
@@ -82,7 +104,7 @@ def _look(path: Path) -> tuple[str, Path]:
     """What is at ``path``, and where that is. Raises OSError for a folder or a disk."""
     try:
         kind = kind_of(path.stat().st_mode)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         kind = "file"  # a new one, also where a link leads to
     if kind == "folder":
         raise OSError(errno.EISDIR, "is a directory", str(path))

@@ -85,7 +85,7 @@ def check_file_target(option: str, path: Path) -> None:
     """Refuses a file that cannot be written before the work, not after it.
 
     Raises:
-        CliError: a missing folder, a directory in the way, or a folder that takes no file.
+        CliError: no folder can be there, a directory in the way, or a folder that takes no file.
     """
     try:
         check_output(path)

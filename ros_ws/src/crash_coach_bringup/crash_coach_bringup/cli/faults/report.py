@@ -20,6 +20,7 @@ from xml.etree import ElementTree
 from crash_coach_bringup.cli.markdown import table
 from crash_coach_bringup.cli.output import CliError, not_written, percent_ci
 from crash_coach_bringup.cli.playing import ALIKE
+from crash_coach_common.whole_output import check_folder, folder_made
 from policy_pkg.play.evaluate import Evaluation
 from policy_pkg.report.verdict import FaultRun, Verdict
 
@@ -70,13 +71,12 @@ def check_target(out: Path) -> None:
     """Refuses a folder that cannot take the report before the work, not after it.
 
     Raises:
-        CliError: no folder to put it in, or something in the way that is not a report.
+        CliError: nowhere to put it, or something in the way that is not a report.
     """
-    parent = out.resolve().parent
-    if not parent.is_dir():
-        raise CliError(f"--out {out}: there is no folder {parent}")
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise CliError(f"--out {out}: the folder {parent} cannot be written to")
+    try:
+        check_folder(out.resolve().parent, out)
+    except OSError as error:
+        raise CliError(f"--out {out}: {error.strerror}") from None
     if not os.path.exists(out):
         return
     try:
@@ -117,13 +117,14 @@ def _replace(out: Path, content: Mapping[str, bytes]) -> None:
     old = out.with_name(f".{out.name}.{os.getpid()}.old")
     moved = False
     try:
-        new.mkdir()
-        for name, data in content.items():
-            (new / name).write_bytes(data)
-        if out.exists():
-            out.rename(old)
-            moved = True
-        new.rename(out)
+        with folder_made(out.parent):
+            new.mkdir()
+            for name, data in content.items():
+                (new / name).write_bytes(data)
+            if out.exists():
+                out.rename(old)
+                moved = True
+            new.rename(out)
     except OSError as error:
         if moved:
             old.rename(out)
