@@ -42,7 +42,7 @@ def check_output(path: Path) -> None:
 
 
 def check_folder(folder: Path, path: Path) -> None:
-    """Raises OSError about ``path`` where nothing can be put into ``folder``, there or to be made."""
+    """Raises OSError about ``path`` where ``folder`` is not there and cannot be made."""
     while not os.path.lexists(folder):
         folder = folder.parent
     if not folder.is_dir():
