@@ -25,12 +25,19 @@ Dash = Literal["-", "--", "-.", ":"]
 
 DASHES: tuple[Dash, ...] = ("-", "--", "-.", ":")
 
+MARKS = ("o", "s", "D", "^")
+
 INK = "#333333"
 
 
 def style(index: int) -> tuple[str, Dash]:
     """Colour and line style of a group."""
     return COLOURS[index % len(COLOURS)], DASHES[index // len(COLOURS) % len(DASHES)]
+
+
+def mark(index: int) -> str:
+    """Of a group's points: another one where ``style``'s colours begin anew."""
+    return MARKS[index // len(COLOURS) % len(MARKS)]
 
 
 def save(figure: Figure, path: Path, kind: str) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from crash_coach_bringup.cli.figure_style import COLOURS, FORMATS, INK, save, style
+from crash_coach_bringup.cli.figure_style import COLOURS, FORMATS, INK, mark, save, style
 from crash_coach_bringup.cli.output import CliError
 from crash_coach_bringup.cli.picture import TeamResults, draw_first_episodes
 from crash_coach_bringup.cli.report.curves import learning_curves
@@ -83,11 +83,11 @@ def resilience(rows: Sequence[Row], methods: Sequence[str]) -> Figure:
         ax.set_xlabel("crashed robots", color=INK)
         ax.set_ylabel("success rate", color=INK)
     handles = [
-        Line2D([], [], color=style(i)[0], linestyle=style(i)[1], marker="o", label=name)
+        Line2D([], [], color=style(i)[0], linestyle=style(i)[1], marker=mark(i), label=name)
         for i, name in enumerate(methods)
     ]
     legend_above(figure, handles)
-    marks = {"dots: mean of the seeds, dashes: each seed": any(len(r.seeds) > 1 for r in rows)}
+    marks = {"large: mean of the seeds, dashes: each seed": any(len(r.seeds) > 1 for r in rows)}
     marks["bar: Wilson's 95 % interval of a single seed"] = any(len(r.seeds) == 1 for r in rows)
     text = "; ".join(text for text, there in marks.items() if there)
     figure.supxlabel(text, fontsize=8, color=INK)
@@ -100,7 +100,7 @@ def _draw_method(ax: Any, rows: Sequence[Row], index: int, shift: float) -> None
     places = [(row.crashed or 0) + shift for row in ordered]
     means = [row.mean for row in ordered]
     ax.plot(places, means, dash, color=colour, linewidth=1.0, alpha=0.35, zorder=2)
-    ax.plot(places, means, "o", color=colour, markersize=7, zorder=3)
+    ax.plot(places, means, mark(index), color=colour, markersize=7, zorder=3)
     for place, row in zip(places, ordered, strict=True):
         if len(row.seeds) > 1:
             points = [place] * len(row.success)

@@ -8,7 +8,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from crash_coach_bringup.cli.figure_style import INK, style
+from crash_coach_bringup.cli.figure_style import INK, mark, style
 from crash_coach_bringup.cli.report.panels import legend_above, panels
 from policy_pkg.report.rows import ALL_MAPS, Row
 from policy_pkg.report.victims import Cost
@@ -37,7 +37,7 @@ def victims(rows: Sequence[Row], costs: Sequence[Cost], methods: Sequence[str]) 
         _draw_map(ax, here, of_map[name], methods)
         ax.set_title(name, fontsize=11, color=INK)
     handles = [
-        Line2D([], [], color=style(i)[0], marker="o", linestyle="", label=name)
+        Line2D([], [], color=style(i)[0], marker=mark(i), linestyle="", label=name)
         for i, name in enumerate(methods)
     ]
     handles.append(Line2D([], [], color=INK, marker="|", linestyle="", label="crash-free"))
@@ -60,8 +60,9 @@ def _draw_map(ax: Any, rows: Sequence[Row], victims: Sequence[str], methods: Seq
         ax.plot(ends, [place] * 2, "-", color=colour, linewidth=1, alpha=0.6)
         ax.plot(ends[1:], [place], "|", color=colour, markersize=8)
         if len(row.seeds) > 1:
-            ax.plot(row.success, [place] * len(row.success), "o", color=colour, ms=3, alpha=0.5)
-        ax.plot(row.mean, place, "o", color=colour, markersize=6, zorder=3)
+            places = [place] * len(row.success)
+            ax.plot(row.success, places, mark(index), color=colour, markersize=3, alpha=0.5)
+        ax.plot(row.mean, place, mark(index), color=colour, markersize=6, zorder=3)
     ax.set_xlim(-0.03, 1.03)
     ax.set_ylim(len(victims) - 0.5, -0.5)
     ax.set_yticks(range(len(victims)))
