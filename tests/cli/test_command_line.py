@@ -180,8 +180,8 @@ def test_json_is_whole_or_absent(tmp_path: Path) -> None:
     write_json(target, {"a": 1})
     assert json.loads(target.read_text()) == {"a": 1}
     assert list(tmp_path.iterdir()) == [target]
-    with pytest.raises(CliError, match="missing"):
-        check_json_target(tmp_path / "missing" / "result.json")
+    with pytest.raises(CliError, match="is not a folder"):
+        check_json_target(target / "result.json")
 
 
 def test_evaluate_writes_what_it_prints(checkpoint: Path, tmp_path: Path) -> None:
