@@ -173,5 +173,4 @@ def _checked(figures: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _write(path: Path, kept: Mapping[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, (json.dumps(kept, indent=1) + "\n").encode())

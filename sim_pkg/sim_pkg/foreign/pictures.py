@@ -152,6 +152,5 @@ def write_still(pictures: Pictures, path: Path) -> None:
     sheet = Image.new("RGB", (len(steps) * (width + _GAP_PX) - _GAP_PX, height), _PAPER)
     for k, step in enumerate(steps.tolist()):
         sheet.paste(Image.fromarray(film.picture(step)), (k * (width + _GAP_PX), 0))
-    path.parent.mkdir(parents=True, exist_ok=True)
     with whole_output(path) as temporary:
         sheet.save(temporary, format="PNG")

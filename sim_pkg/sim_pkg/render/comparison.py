@@ -67,7 +67,6 @@ def draw_trajectories(panels: Sequence[Panel], path: Path) -> None:
     )  # fmt: skip
     figure.subplots_adjust(left=0.02, right=0.98, top=0.92, bottom=0.11, wspace=0.05)
     FigureCanvasAgg(figure)
-    path.parent.mkdir(parents=True, exist_ok=True)
     with whole_output(path) as temporary:
         figure.savefig(temporary, format="png")
 

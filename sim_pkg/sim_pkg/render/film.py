@@ -84,7 +84,6 @@ def write_video(
     if path.suffix not in writers:
         raise ValueError(f"{path}: a film is a .mp4 or .gif file")
     write, fps = writers[path.suffix]
-    path.parent.mkdir(parents=True, exist_ok=True)
     film: Film = (
         PictureFilm(frames) if isinstance(frames, Pictures) else EpisodeFilm(frames, caption)
     )

@@ -48,7 +48,6 @@ def draw_still(frames: Frames, path: Path, caption: str = "") -> None:
         stage.ax.add_patch(patch)
     for index in reversed(range(len(frames.actors))):
         _draw_way(stage, frames, index)
-    path.parent.mkdir(parents=True, exist_ok=True)
     with whole_output(path) as temporary:
         stage.figure.savefig(temporary, format="png", dpi=STILL_DPI)
 
