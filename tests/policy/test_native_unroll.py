@@ -18,12 +18,15 @@ from policy_pkg.policy import weight_shapes
 Arrays = dict[str, npt.NDArray[Any]]
 BUILDS = [name for name in native.FLAGS if native.FLAGS[name] <= native._flags()]
 
-# (input size, hidden, actions, rows at each time): odd sizes, one row, several blocks of rows
+# (input size, hidden, actions, rows at each time, share of inputs not zero): odd sizes, one row,
+# several blocks of rows, zeros that are left out
 CASES = [
-    (7, 8, 5, [3, 3, 2, 1]),
-    (4, 20, 3, [1]),
-    (9, 64, 5, [64] * 6 + [37] * 5 + [5]),
-    (33, 70, 33, [13, 12, 12, 9, 9, 9, 2]),
+    (7, 8, 5, [3, 3, 2, 1], 1.0),
+    (4, 20, 3, [1], 1.0),
+    (9, 64, 5, [64] * 6 + [37] * 5 + [5], 1.0),
+    (33, 70, 33, [13, 12, 12, 9, 9, 9, 2], 1.0),
+    (150, 64, 14, [300, 257, 256, 65], 0.3),
+    (131, 100, 3, [70, 64, 33], 0.1),
 ]
 
 
@@ -36,11 +39,12 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def problem(case: int) -> tuple[Arrays, npt.NDArray[Any], npt.NDArray[Any], list[int]]:
-    inputs, hidden, actions, rows = CASES[case]
+    inputs, hidden, actions, rows, share = CASES[case]
     rng = np.random.default_rng(case)
     shapes = weight_shapes(inputs, hidden, actions)
     params = {k: 0.3 * rng.standard_normal(s).astype(np.float32) for k, s in shapes.items()}
     x = rng.standard_normal((sum(rows), inputs)).astype(np.float32)
+    x[rng.random(x.shape) >= share] = 0.0
     grad = rng.standard_normal((sum(rows), actions)).astype(np.float32) / len(x)
     return params, x, grad, rows
 
@@ -106,6 +110,17 @@ def test_a_sequence_alone_has_the_bits_it_has_in_a_batch(kernel: Any, name: str)
         own = [start + row for start, size in zip(starts, rows, strict=True) if row < size]
         alone = values(params, x[own], [1] * len(own))
         np.testing.assert_array_equal(alone, together[own])
+
+
+@pytest.mark.parametrize("name", BUILDS)
+def test_zeros_left_out_and_zeros_added_give_the_same_bits(kernel: Any, name: str) -> None:
+    """Where most of some rows is zero the kernel leaves zeros out; with a full row alone not."""
+    kernel(name)
+    params, x, _, _ = problem(4)
+    x[:31], x[31] = 0.0, np.where(x[31] == 0.0, 1.0, x[31])
+    x[31, 7] = 0.0
+    together = values(params, x[:32], [32])
+    np.testing.assert_array_equal(values(params, x[31:32], [1]), together[31:])
 
 
 @pytest.mark.parametrize("name", BUILDS)

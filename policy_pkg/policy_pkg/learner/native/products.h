@@ -12,11 +12,26 @@
 
 #include <cstddef>
 #include <cstring>
+#include <new>
 #include <vector>
 
 #include "vectors.h"
 
 namespace {
+
+// Memory that begins at a line of the cache: a vector of 64 bytes elsewhere lies in two.
+template <class T>
+struct Lines {
+    using value_type = T;
+    static constexpr std::align_val_t LINE{64};
+    T* allocate(size_t n) { return static_cast<T*>(::operator new(n * sizeof(T), LINE)); }
+    void deallocate(T* p, size_t) { ::operator delete(p, LINE); }
+    template <class U>
+    bool operator==(const Lines<U>&) const { return true; }
+    template <class U>
+    bool operator!=(const Lines<U>&) const { return false; }
+};
+using Floats = std::vector<float, Lines<float>>;
 
 constexpr int BLOCK = 256;
 constexpr int WIDE = 2 * LANES;  // columns of a tile
@@ -76,34 +91,40 @@ inline void product(Start start, int rows, int columns, int depth, const float* 
 
 int padded(int n) { return (n + PAD - 1) / PAD * PAD; }
 
-// A weight as tiles want it: panels of WIDE columns, each (depth x WIDE) without gaps.
+// A weight (depth x columns): in panels of WIDE columns, each without gaps, as tiles want it, or row
+// after row, as single rows do.
 struct Packed {
-    std::vector<float> data;
+    Floats data;
     int depth, columns;
-    ptrdiff_t panel() const { return static_cast<ptrdiff_t>(depth) * WIDE; }
+    ptrdiff_t panel, ldb;
 };
 
 Packed packed(int depth, int columns) {
-    return {std::vector<float>(static_cast<size_t>(depth) * columns, 0.0f), depth, columns};
+    return {Floats(static_cast<size_t>(depth) * columns, 0.0f), depth, columns,
+            static_cast<ptrdiff_t>(depth) * WIDE, WIDE};
+}
+
+Packed in_rows(int depth, int columns) {
+    return {Floats(static_cast<size_t>(depth) * columns, 0.0f), depth, columns, WIDE, columns};
 }
 
 // Rows k, k + 1, ... of a column.
 void put_column(Packed& to, int k, int column, const float* values, int count) {
-    float* at = to.data.data() + (column / WIDE) * to.panel() + static_cast<ptrdiff_t>(k) * WIDE + column % WIDE;
-    for (int i = 0; i < count; ++i) at[static_cast<ptrdiff_t>(i) * WIDE] = values[i];
+    float* at = to.data.data() + (column / WIDE) * to.panel + k * to.ldb + column % WIDE;
+    for (int i = 0; i < count; ++i) at[i * to.ldb] = values[i];
 }
 
 // The first columns of row k.
 void put_row(Packed& to, int k, const float* values, int count) {
     for (int j = 0; j < count; j += WIDE)
-        std::memcpy(to.data.data() + (j / WIDE) * to.panel() + static_cast<ptrdiff_t>(k) * WIDE, values + j,
+        std::memcpy(to.data.data() + (j / WIDE) * to.panel + k * to.ldb, values + j,
                     sizeof(float) * (count - j < WIDE ? count - j : WIDE));
 }
 
 // C = A B for a packed B; A is (rows x depth), row-major.
 void times(Start start, int rows, const float* a, ptrdiff_t lda, const Packed& b, const float* bias,
            float* c, ptrdiff_t ldc) {
-    product<false>(start, rows, b.columns, b.depth, a, lda, 1, b.data.data(), b.panel(), WIDE, bias, c, ldc);
+    product<false>(start, rows, b.columns, b.depth, a, lda, 1, b.data.data(), b.panel, b.ldb, bias, c, ldc);
 }
 
 // C (m x n) += A' B summed over rows, in blocks; A is (rows x m), B (rows x n), n padded.

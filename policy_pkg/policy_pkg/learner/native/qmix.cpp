@@ -103,7 +103,7 @@ void qmix_forward(int rows, int robots, int states, int mixing, int hyper, const
     const Sizes size(robots, states, mixing, hyper);
     const float *state_w = parameters[0], *w1_w = parameters[2], *w2_w = parameters[4];
     Packed to_first = packed(states, size.first), to_w1 = packed(hyper, size.weights), to_w2 = packed(hyper, size.m);
-    std::vector<float> first_b(size.first, 0.0f), w1_b(size.weights, 0.0f), w2_b(size.m, 0.0f), v_w(size.m, 0.0f);
+    Floats first_b(size.first, 0.0f), w1_b(size.weights, 0.0f), w2_b(size.m, 0.0f), v_w(size.m, 0.0f);
     for (int j = 0; j < size.columns(); ++j) {
         put_column(to_first, 0, size.column(j), state_w + static_cast<ptrdiff_t>(j) * states, states);
         first_b[size.column(j)] = parameters[1][j];
@@ -117,7 +117,7 @@ void qmix_forward(int rows, int robots, int states, int mixing, int hyper, const
         put_column(to_w2, 0, k, w2_w + static_cast<ptrdiff_t>(k) * hyper, hyper);
         w2_b[k] = parameters[5][k], v_w[k] = parameters[6][k];
     }
-    std::vector<float> scratch(tape_ ? 0 : tape_floats(TILE, size));
+    Floats scratch(tape_ ? 0 : tape_floats(TILE, size));
     const Tape tape = tape_of(tape_ ? tape_ : scratch.data(), tape_ ? rows : TILE, size);
     for (ptrdiff_t row = 0; row < rows; row += TILE) {
         const int count = rows - row < TILE ? rows - row : TILE;
@@ -156,17 +156,17 @@ void qmix_backward(int rows, int robots, int states, int mixing, int hyper, cons
     const Tape tape = tape_of(tape_, rows, size);
     const float *w1_w = parameters[2], *w2_w = parameters[4];
     Packed back_w1 = packed(size.weights, size.h), back_w2 = packed(size.m, size.h);
-    std::vector<float> v_w(size.m, 0.0f);
+    Floats v_w(size.m, 0.0f);
     for (int k = 0; k < mixing; ++k) {
         for (int robot = 0; robot < robots; ++robot)
             put_row(back_w1, robot * size.m + k, w1_w + static_cast<ptrdiff_t>(robot * mixing + k) * hyper, hyper);
         put_row(back_w2, k, w2_w + static_cast<ptrdiff_t>(k) * hyper, hyper);
         v_w[k] = parameters[6][k];
     }
-    std::vector<float> first(static_cast<size_t>(states) * size.first), w1(static_cast<size_t>(size.weights) * size.h),
+    Floats first(static_cast<size_t>(states) * size.first), w1(static_cast<size_t>(size.weights) * size.h),
         w2(static_cast<size_t>(size.m) * size.h), v(size.m), first_b(size.first), w1_b(size.weights), w2_b(size.m);
     // Some rows at a time, while they are in the cache.
-    std::vector<float> kept(static_cast<size_t>(BLOCK) * (size.first + size.weights + size.m));
+    Floats kept(static_cast<size_t>(BLOCK) * (size.first + size.weights + size.m));
     float *d_first = kept.data(), *d_w1 = d_first + BLOCK * size.first, *d_w2 = d_w1 + BLOCK * size.weights;
     for (ptrdiff_t from = 0; from < rows; from += BLOCK) {
         const int count = rows - from < BLOCK ? rows - from : BLOCK;

@@ -1,6 +1,6 @@
 // The agent net, Linear - ReLU - GRU - Linear, over a packed batch: forward, and backward by hand.
 
-#include "products.h"
+#include "sparse.h"
 
 namespace {
 
@@ -8,11 +8,11 @@ namespace {
 struct Net {
     int inputs, hidden, actions, h, a;  // h, a: hidden and actions, padded
     Packed fc1, w_ih, w_hh_rz, w_hh_n, fc2;
-    std::vector<float> bias1, bias, bias_hn, bias2;
+    Floats bias1, bias, bias_hn, bias2;
 
     Net(int inputs_, int hidden_, int actions_, const float* const* p)
         : inputs(inputs_), hidden(hidden_), actions(actions_), h(padded(hidden_)), a(padded(actions_)),
-          fc1(packed(inputs_, h)), w_ih(packed(hidden_, 3 * h)), w_hh_rz(packed(hidden_, 2 * h)),
+          fc1(in_rows(inputs_, h)), w_ih(in_rows(hidden_, 3 * h)), w_hh_rz(packed(hidden_, 2 * h)),
           w_hh_n(packed(hidden_, h)), fc2(packed(hidden_, a)), bias1(h, 0.0f), bias(3 * h, 0.0f),
           bias_hn(h, 0.0f), bias2(a, 0.0f) {
         const float *fc1_w = p[0], *fc1_b = p[1], *ih = p[2], *hh = p[3], *b_ih = p[4], *b_hh = p[5],
@@ -59,6 +59,12 @@ void gates(int rows, int h, const float* sums, const float* before, float* rz, f
         }
 }
 
+bool all_zero(const float* x, int count) {
+    for (int j = 0; j < count; ++j)
+        if (x[j] != 0.0f) return false;
+    return true;
+}
+
 void clear_padding(int rows, int h, int hidden, float* x) {
     if (hidden < h)
         for (int i = 0; i < rows; ++i) std::memset(x + i * h + hidden, 0, sizeof(float) * (h - hidden));
@@ -78,28 +84,29 @@ void unroll_forward(int times_, const int* sizes, int rows, int inputs, int hidd
                     const float* x, const float* const* parameters, float* q, float* tape_) {
     const Net net(inputs, hidden, actions, parameters);
     const int h = net.h, most = sizes[0];
-    std::vector<float> scratch, states[2];
+    Floats scratch, states[2];
     if (!tape_) {
-        scratch.resize(static_cast<size_t>(TILE) * 6 * h);
+        scratch.resize(static_cast<size_t>(CHUNK) * 6 * h);
         for (auto& state : states) state.resize(static_cast<size_t>(most) * h);
     }
-    const Tape tape(tape_ ? tape_ : scratch.data(), tape_ ? rows : TILE, h);
-    const std::vector<float> zero(static_cast<size_t>(TILE) * h, 0.0f);
-    std::vector<float> sums(static_cast<size_t>(TILE) * 3 * h), out(static_cast<size_t>(TILE) * net.a);
+    const Tape tape(tape_ ? tape_ : scratch.data(), tape_ ? rows : CHUNK, h);
+    const Floats zero(static_cast<size_t>(CHUNK) * h, 0.0f);
+    Floats sums(static_cast<size_t>(CHUNK) * 3 * h), out(static_cast<size_t>(CHUNK) * net.a);
+    Nonzero in_x(inputs), in_embedded(hidden);
     ptrdiff_t at = 0, earlier = 0;
     for (int t = 0; t < times_; earlier = at, at += sizes[t], ++t) {
         const float* all_before = tape_ ? tape.hidden + earlier * h : states[(t + 1) % 2].data();
         float* all_after = tape_ ? tape.hidden + at * h : states[t % 2].data();
-        for (int i = 0; i < sizes[t]; i += TILE) {
-            const int m = sizes[t] - i < TILE ? sizes[t] - i : TILE;
+        for (int i = 0; i < sizes[t]; i += CHUNK) {
+            const int m = sizes[t] - i < CHUNK ? sizes[t] - i : CHUNK;
             const ptrdiff_t row = at + i, kept = tape_ ? row : 0;
             const float* before = t ? all_before + static_cast<ptrdiff_t>(i) * h : zero.data();
             float *embedded = tape.embedded + kept * h, *n_hidden = tape.n_hidden + kept * h,
                   *after = all_after + static_cast<ptrdiff_t>(i) * h;
-            times(Start::bias, m, x + row * inputs, inputs, net.fc1, net.bias1.data(), embedded, h);
+            times_sparse(m, x + row * inputs, inputs, net.fc1, net.bias1.data(), embedded, h, in_x);
             for (int j = 0; j < m * h; j += LANES) store(embedded + j, larger(all(0.0f), load(embedded + j)));
-            times(Start::bias, m, embedded, h, net.w_ih, net.bias.data(), sums.data(), 3 * h);
-            times(Start::c, m, before, h, net.w_hh_rz, nullptr, sums.data(), 3 * h);
+            times_sparse(m, embedded, h, net.w_ih, net.bias.data(), sums.data(), 3 * h, in_embedded);
+            if (t) times(Start::c, m, before, h, net.w_hh_rz, nullptr, sums.data(), 3 * h);
             times(Start::bias, m, before, h, net.w_hh_n, net.bias_hn.data(), n_hidden, h);
             gates(m, h, sums.data(), before, tape.rz + kept * 2 * h, tape.n + kept * h, n_hidden, after);
             clear_padding(m, h, hidden, after);
@@ -128,20 +135,29 @@ void unroll_backward(int times_, const int* sizes, int rows, int inputs, int hid
         }
     // One time's rows at a time, while they are in the cache. Kept between calls: fresh pages cost more
     // than the arithmetic on them.
-    static thread_local std::vector<float> kept;
-    const size_t most = sizes[0], needed = most * 7 * h;  // gates 4, embedded 1, hidden 2
+    static thread_local Floats kept;
+    // Rows whose distance is a power of two would share a few lines of the cache: one vector more.
+    const size_t most = sizes[0], gates = 4 * h + LANES, wide = padded(inputs) + LANES,
+                 needed = most * (gates + 3 * h + wide);  // gates 4, embedded 1, hidden 2, inputs
     if (kept.size() < needed) kept.resize(needed);
-    float *grad_gates = kept.data(), *grad_embedded = grad_gates + most * 4 * h,
-          *grad_hidden[] = {grad_embedded + most * h, grad_embedded + most * 2 * h};
+    float *grad_gates = kept.data(), *grad_embedded = grad_gates + most * gates,
+          *grad_hidden[] = {grad_embedded + most * h, grad_embedded + most * 2 * h},
+          *x_padded = grad_embedded + most * 3 * h;
+    for (size_t i = 0; i < most; ++i) std::memset(x_padded + i * wide, 0, sizeof(float) * wide);
+    SparseColumns embedded_in;
     // Sums over rows: vectors run over the padded side.
-    std::vector<float> w_in(static_cast<size_t>(3 * h) * h), w_re(w_in), w1(static_cast<size_t>(inputs) * h),
+    Floats w_in(static_cast<size_t>(h) * 3 * h), w_re(w_in), w1(static_cast<size_t>(h) * wide),
         w2(static_cast<size_t>(actions) * h), b(4 * h), b1(h);
-    const std::vector<float> zero(most * h, 0.0f);
+    const Floats zero(most * h, 0.0f);
     ptrdiff_t at = rows - sizes[times_ - 1];
     times(Start::zero, sizes[times_ - 1], grad_q + at * actions, actions, back_q, nullptr,
           grad_hidden[(times_ - 1) % 2], h);
     for (int t = times_ - 1; t >= 0; --t) {
-        const int count = sizes[t];
+        // A sequence that ends here, and whose last values the loss does not use, has no gradient yet.
+        int count = sizes[t];
+        for (const int going_on = t + 1 < times_ ? sizes[t + 1] : 0;
+             count > going_on && all_zero(grad_q + (at + count - 1) * actions, actions);)
+            --count;
         const ptrdiff_t earlier = t ? at - sizes[t - 1] : 0;
         const float* before = t ? tape.hidden + earlier * h : zero.data();
         float *from = grad_hidden[t % 2], *into = grad_hidden[(t + 1) % 2];
@@ -149,7 +165,7 @@ void unroll_backward(int times_, const int* sizes, int rows, int inputs, int hid
         for (ptrdiff_t i = 0; i < count; ++i) {
             const float *rz = tape.rz + (at + i) * 2 * h, *n = tape.n + (at + i) * h,
                         *nh = tape.n_hidden + (at + i) * h;
-            float* g = grad_gates + i * 4 * h;
+            float* g = grad_gates + i * gates;
             for (int j = 0; j < h; j += LANES) {
                 const Vec grad = load(from + i * h + j), one = all(1.0f);
                 const Vec r = load(rz + j), z = load(rz + h + j), c = load(n + j), p = load(before + i * h + j);
@@ -163,28 +179,31 @@ void unroll_backward(int times_, const int* sizes, int rows, int inputs, int hid
             }
         }
         if (t) {
-            times(Start::c, count, grad_gates + h, 4 * h, back_hidden, nullptr, into, h);
-            add_over_rows(count, grad_gates + h, 4 * h, 3 * h, before, h, h, w_re.data(), h);
+            times(Start::c, count, grad_gates + h, gates, back_hidden, nullptr, into, h);
+            add_over_rows(count, grad_gates + h, gates, 3 * h, before, h, h, w_re.data(), h);
         }
-        times(Start::zero, count, grad_gates, 4 * h, back_input, nullptr, grad_embedded, h);
+        times(Start::zero, count, grad_gates, gates, back_input, nullptr, grad_embedded, h);
         const float* embedded = tape.embedded + at * h;
         for (ptrdiff_t j = 0; j < static_cast<ptrdiff_t>(count) * h; j += LANES)
             store(grad_embedded + j, where_positive(load(embedded + j), load(grad_embedded + j)));
-        add_over_rows(count, grad_gates, 4 * h, 3 * h, embedded, h, h, w_in.data(), h);
-        add_over_rows(count, x + at * inputs, inputs, inputs, grad_embedded, h, h, w1.data(), h);
+        for (ptrdiff_t i = 0; i < count; ++i)
+            std::memcpy(x_padded + i * wide, x + (at + i) * inputs, sizeof(float) * inputs);
+        embedded_in.find(count, embedded, h, h);
+        embedded_in.add_over_rows(embedded, h, hidden, grad_gates, gates, 3 * h, w_in.data(), 3 * h);
+        embedded_in.add_over_rows(grad_embedded, h, hidden, x_padded, wide, padded(inputs), w1.data(), wide);
         add_over_rows(count, grad_q + at * actions, actions, actions, tape.hidden + at * h, h, h, w2.data(), h);
-        add_column_sums(count, grad_gates, 4 * h, 4 * h, b.data());
+        add_column_sums(count, grad_gates, gates, 4 * h, b.data());
         add_column_sums(count, grad_embedded, h, h, b1.data());
         at = earlier;
     }
     for (int j = 0; j < hidden; ++j) {
         gradients[1][j] = b1[j];
-        for (int k = 0; k < inputs; ++k) gradients[0][j * inputs + k] = w1[k * h + j];
+        std::memcpy(gradients[0] + static_cast<ptrdiff_t>(j) * inputs, w1.data() + j * wide, sizeof(float) * inputs);
         for (int gate = 0; gate < 3; ++gate) {
             const int to = gate * hidden + j, input_at = gate == 2 ? j : (gate + 1) * h + j;
             gradients[4][to] = b[input_at];
             gradients[5][to] = b[(gate + 1) * h + j];
-            std::memcpy(gradients[2] + to * hidden, w_in.data() + input_at * h, sizeof(float) * hidden);
+            for (int k = 0; k < hidden; ++k) gradients[2][to * hidden + k] = w_in[k * 3 * h + input_at];
             std::memcpy(gradients[3] + to * hidden, w_re.data() + (gate * h + j) * h, sizeof(float) * hidden);
         }
     }

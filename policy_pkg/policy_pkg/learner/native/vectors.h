@@ -5,6 +5,7 @@
 #include <immintrin.h>
 
 #include <cstddef>
+#include <cstdint>
 
 namespace {
 
@@ -31,6 +32,13 @@ inline Vec two_to(Vec n) {
 inline Vec where_positive(Vec x, Vec value) {
     return _mm512_maskz_mov_ps(_mm512_cmp_ps_mask(x, _mm512_setzero_ps(), _CMP_GT_OQ), value);
 }
+inline uint32_t nonzero(Vec x) { return _mm512_cmp_ps_mask(x, _mm512_setzero_ps(), _CMP_NEQ_UQ); }
+using Bits = __m512i;
+inline Bits no_bits() { return _mm512_setzero_si512(); }
+inline Bits with_bit(Bits bits, uint32_t bit, Vec x) {
+    return _mm512_mask_or_epi32(bits, nonzero(x), bits, _mm512_set1_epi32(static_cast<int>(bit)));
+}
+inline void store(uint32_t* p, Bits bits) { _mm512_storeu_si512(p, bits); }
 #else
 constexpr int LANES = 8, TILE = 6;
 using Vec = __m256;
@@ -52,6 +60,15 @@ inline Vec two_to(Vec n) {
 inline Vec where_positive(Vec x, Vec value) {
     return _mm256_and_ps(_mm256_cmp_ps(x, _mm256_setzero_ps(), _CMP_GT_OQ), value);
 }
+inline Vec differs_from_zero(Vec x) { return _mm256_cmp_ps(x, _mm256_setzero_ps(), _CMP_NEQ_UQ); }
+inline uint32_t nonzero(Vec x) { return static_cast<uint32_t>(_mm256_movemask_ps(differs_from_zero(x))); }
+using Bits = __m256i;
+inline Bits no_bits() { return _mm256_setzero_si256(); }
+inline Bits with_bit(Bits bits, uint32_t bit, Vec x) {
+    const __m256i which = _mm256_castps_si256(differs_from_zero(x));
+    return _mm256_or_si256(bits, _mm256_and_si256(which, _mm256_set1_epi32(static_cast<int>(bit))));
+}
+inline void store(uint32_t* p, Bits bits) { _mm256_storeu_si256(reinterpret_cast<__m256i*>(p), bits); }
 #endif
 
 // The maximum of two vectors is its second operand where one is not a number: data comes second, so
