@@ -9,7 +9,7 @@
 namespace {
 
 constexpr int WORD = 64;
-constexpr int CHUNK = 32;     // rows that weights in the first cache serve before others come
+constexpr int CHUNK = 128;    // rows that weights in the first cache serve before others come
 constexpr float MANY = 0.8f;  // of the values not zero: from here on leaving out the others does not pay
 
 // sum += a[k * step] times the columns of B's row k, for the bits k of a word.
