@@ -100,17 +100,22 @@ def gradient_step_ms(sizes: Sizes, full_lengths: bool, repeats: int) -> tuple[fl
     return 1e3 * statistics.median(ours_s), 1e3 * statistics.median(padded_s)
 
 
-def _step_row(name: str, sizes: Sizes, full_lengths: bool, target: float | None) -> Row:
-    ours, padded = gradient_step_ms(sizes, full_lengths, 100 if sizes is BUTTONS else 25)
+def _row(name: str, ours_ms: float, reference_ms: float, target: float | None) -> Row:
+    ratio = reference_ms / ours_ms
     return {
         "name": name,
-        "value": round(ours, 2),
+        "value": round(ours_ms, 2),
         "unit": "ms",
-        "reference": round(padded, 2),
-        "ratio": round(padded / ours, 2),
+        "reference": round(reference_ms, 2),
+        "ratio": round(ratio, 2),
         "target": f">= {target}x" if target is not None else None,
-        "ok": target is None or padded / ours >= target,
+        "ok": target is None or ratio >= target,
     }
+
+
+def _step_row(name: str, sizes: Sizes, full_lengths: bool, target: float | None) -> Row:
+    times = gradient_step_ms(sizes, full_lengths, 100 if sizes is BUTTONS else 25)
+    return _row(name, *times, target)
 
 
 def _numpy_row(name: str, content: tuple[Sizes, list[Episode]], target: float | None) -> Row:
@@ -132,15 +137,7 @@ def _numpy_row(name: str, content: tuple[Sizes, list[Episode]], target: float | 
             ours_s.append(middle - start)
             before_s.append(time.process_time() - middle)
     ours, plain = (1e3 * statistics.median(seconds) for seconds in (ours_s, before_s))
-    return {
-        "name": name,
-        "value": round(ours, 2),
-        "unit": "ms",
-        "reference": round(plain, 2),
-        "ratio": round(plain / ours, 2),
-        "target": f">= {target}x" if target is not None else None,
-        "ok": target is None or plain / ours >= target,
-    }
+    return _row(name, ours, plain, target)
 
 
 def _replay_row() -> Row:
