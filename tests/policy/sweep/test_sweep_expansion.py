@@ -152,7 +152,7 @@ def test_the_papers_sweeps_can_be_read(name: str, size: str) -> None:
         ("ablation", "full", 5, 10),
         ("combat", "full", 10, 5),
         ("combat", "3s_vs_5z", 10, 5),
-        ("combat", "3s_vs_5z_long", 9, 3),
+        ("combat", "3s_vs_5z_long", 4, 3),
         ("combat", "3s5z_vs_3s5z", 9, 5),
         ("combat", "8m_vs_5z", 9, 5),
     ],
