@@ -15,18 +15,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.bench_rollout import ARENAS, EPSILON, crashing_rollout
 from benchmarks.numpy_learner.learner import NumpyLearner
 from benchmarks.padded_learner import PaddedLearner, PaddedReplay
-from crash_coach_pkg.coach.coach import Coach
-from crash_coach_pkg.coach.config import CoachConfig
-from crash_coach_pkg.team import TeamSpec
 from policy_pkg.episode import Episode, Sizes
 from policy_pkg.learner.config import LearnerConfig
 from policy_pkg.learner.learner import Learner
 from policy_pkg.learner.replay import Replay
-from policy_pkg.play.rollout import Rollout
-from policy_pkg.policy import RecurrentPolicy
-from sim_pkg.env import make_env
 
 PLAYED = "skirmish/3s5z_vs_3s5z"  # as large as COMBAT
 COMBAT = Sizes(n_robots=8, n_actions=14, obs_size=128, state_size=216, episode_limit=60)
@@ -56,16 +51,10 @@ def random_episode(sizes: Sizes, rng: np.random.Generator, steps: int) -> Episod
 
 def played_episodes() -> tuple[Sizes, list[Episode]]:
     """What an untrained team saw and did, half at random, crashed at rate 0.1."""
-    env = make_env(PLAYED, 32)
-    spec, sizes = env.spec, Sizes.of(env.spec)
-    weights = Learner(LearnerConfig(), sizes, seed=0).agent_weights()
-    policy = RecurrentPolicy(weights, spec.n_robots, spec.n_actions)
-    crash = CoachConfig.model_validate({"strategy": "fixed", "crash_rate": 0.1})
-    coach = Coach(crash, TeamSpec.of(spec), seed=0)
-    rollout = Rollout(env, policy, coach.plan, 0, np.random.default_rng(0))
+    rollout, sizes = crashing_rollout(PLAYED, ARENAS)
     episodes: list[Episode] = []
     while len(episodes) < STORED_EPISODES:
-        episodes += [finished.episode for finished in rollout.step(0.5)]
+        episodes += [finished.episode for finished in rollout.step(EPSILON)]
     return sizes, episodes[:STORED_EPISODES]
 
 

@@ -53,15 +53,20 @@ def steps_per_cpu_s(work: Callable[[], None], env_steps: int) -> float:
     return float(np.median(rates))
 
 
-def rollout_rate(scenario: str, arenas: int, calls: int) -> float:
-    """Acting, exploring, crashing, stepping, and storing whole episodes in a replay."""
+def crashing_rollout(scenario: str, arenas: int) -> tuple[Rollout, Sizes]:
+    """Of an untrained team, each robot crashed with CRASH_RATE."""
     env = make_env(scenario, arenas)
     spec, sizes = env.spec, Sizes.of(env.spec)
     weights = Learner(LearnerConfig.model_validate({}), sizes, seed=0).agent_weights()
     policy = RecurrentPolicy(weights, spec.n_robots, spec.n_actions)
     crash = CoachConfig.model_validate({"strategy": "fixed", "crash_rate": CRASH_RATE})
     coach = Coach(crash, TeamSpec.of(spec), seed=0)
-    rollout = Rollout(env, policy, coach.plan, 0, np.random.default_rng(0))
+    return Rollout(env, policy, coach.plan, 0, np.random.default_rng(0)), sizes
+
+
+def rollout_rate(scenario: str, arenas: int, calls: int) -> float:
+    """Acting, exploring, crashing, stepping, and storing whole episodes in a replay."""
+    rollout, sizes = crashing_rollout(scenario, arenas)
     replay = Replay(500, sizes)
 
     def work() -> None:

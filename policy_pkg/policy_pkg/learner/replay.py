@@ -25,10 +25,10 @@ import numpy.typing as npt
 
 from crash_coach_common.quick_numba import njit
 from policy_pkg.episode import Episode, Sizes
+from policy_pkg.learner.memory import room
 from policy_pkg.learner.strata import Strata
 
 Array = npt.NDArray[Any]
-_ALIGNMENT_BYTES = 64
 _EVEN_SHARE = 0.5  # of the sampling probability, spread evenly over the strata
 
 
@@ -214,17 +214,11 @@ class Replay:
         )
 
     def _buffer(self, name: str, dtype: npt.DTypeLike, shape: tuple[int, ...]) -> Array:
-        """A view of a buffer that is kept between calls: fresh pages cost more than the copy.
-
-        Its start is aligned, since a BLAS may sum in another order on unaligned memory.
-        """
-        item = np.dtype(dtype).itemsize
-        needed = prod(shape) * item
+        """A view of a buffer that is kept between calls."""
+        needed = prod(shape) * np.dtype(dtype).itemsize
         kept = self._buffers.get(name)
         if kept is None or kept.nbytes < needed:
-            raw = np.empty(needed + needed // 4 + _ALIGNMENT_BYTES, np.uint8)
-            start = -raw.ctypes.data % _ALIGNMENT_BYTES
-            kept = self._buffers[name] = raw[start:]
+            kept = self._buffers[name] = room(needed)
         return kept[:needed].view(dtype).reshape(shape)
 
     def state_dict(self) -> dict[str, Array]:

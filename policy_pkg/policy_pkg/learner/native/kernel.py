@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from policy_pkg.learner import native
+from policy_pkg.learner.memory import room
 
 Tape = npt.NDArray[np.float32]
-_LINE_BYTES, _LINE_FLOATS = 64, 16
 _INT, _POINTER = ctypes.c_int, ctypes.c_void_p
 _UNROLL: list[Any] = [_INT, _POINTER, _INT, _INT, _INT, _INT]
 _QMIX: list[Any] = [_INT] * 5
@@ -51,11 +51,7 @@ def library(*tensors: Tensor) -> ctypes.CDLL | None:
 
 
 class Tapes:
-    """Memory for what forward passes leave for backward ones.
-
-    Kept between calls: fresh pages cost more than the arithmetic on them. It begins at a line of
-    the cache: a vector of 64 bytes elsewhere lies in two.
-    """
+    """Memory for what forward passes leave for backward ones."""
 
     def __init__(self) -> None:
         self._free: list[Tape] = []
@@ -66,8 +62,8 @@ class Tapes:
             tape = self._free.pop()
             if len(tape) >= floats:
                 return tape
-        raw = np.empty(floats + floats // 4 + _LINE_FLOATS, np.float32)
-        return raw[-raw.ctypes.data % _LINE_BYTES // raw.itemsize :]
+        memory = room(4 * floats)
+        return memory[: len(memory) // 4 * 4].view(np.float32)
 
     def give_back(self, tape: Tape) -> None:
         self._free.append(tape)
