@@ -4,6 +4,8 @@
 
 #pragma once
 
+#include <type_traits>
+
 #include "products.h"
 
 namespace {
@@ -11,6 +13,15 @@ namespace {
 constexpr int WORD = 64;
 constexpr int CHUNK = 128;    // rows that weights in the first cache serve before others come
 constexpr float MANY = 0.8f;  // of the values not zero: from here on leaving out the others does not pay
+
+// part(width, j) for each run of columns from j on of n padded ones, its width a constant.
+template <typename Part>
+void by_columns(int n, const Part& part) {
+    int j = 0;
+    for (; n - j >= 3 * PAD; j += 3 * PAD) part(std::integral_constant<int, 3 * PAD>(), j);
+    if (n - j == 2 * PAD) part(std::integral_constant<int, 2 * PAD>(), j);
+    if (n - j == PAD) part(std::integral_constant<int, PAD>(), j);
+}
 
 // sum += a[k * step] times the columns of B's row k, for the bits k of a word.
 template <int COLUMNS>
@@ -72,11 +83,9 @@ void times_sparse(int rows, const float* a, ptrdiff_t lda, const Packed& b, cons
         return;
     }
     const float* from = b.data.data();
-    int j = 0;
-    for (; b.columns - j >= 3 * PAD; j += 3 * PAD)
-        in_a.times<3 * PAD>(rows, a, lda, from + j, b.ldb, bias + j, c + j, ldc);
-    if (b.columns - j == 2 * PAD) in_a.times<2 * PAD>(rows, a, lda, from + j, b.ldb, bias + j, c + j, ldc);
-    if (b.columns - j == PAD) in_a.times<PAD>(rows, a, lda, from + j, b.ldb, bias + j, c + j, ldc);
+    by_columns(b.columns, [&](auto width, int j) {
+        in_a.times<width>(rows, a, lda, from + j, b.ldb, bias + j, c + j, ldc);
+    });
 }
 
 // Sums over rows, without those where a matrix is zero.
@@ -99,10 +108,7 @@ public:
     // A is (rows x m), B (rows x n), n padded.
     void add_over_rows(const float* a, ptrdiff_t lda, int m, const float* b, ptrdiff_t ldb, int n, float* c,
                        ptrdiff_t ldc) {
-        int j = 0;
-        for (; n - j >= 3 * PAD; j += 3 * PAD) add_wide<3 * PAD>(a, lda, m, b + j, ldb, c + j, ldc);
-        if (n - j == 2 * PAD) add_wide<2 * PAD>(a, lda, m, b + j, ldb, c + j, ldc);
-        if (n - j == PAD) add_wide<PAD>(a, lda, m, b + j, ldb, c + j, ldc);
+        by_columns(n, [&](auto width, int j) { add_wide<width>(a, lda, m, b + j, ldb, c + j, ldc); });
     }
 
 private:

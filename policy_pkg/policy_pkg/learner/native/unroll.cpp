@@ -43,7 +43,7 @@ struct Tape {
           hidden(at + 5 * rows * h) {}
 };
 
-// Of a tile of rows, with the sums of r, z and the candidate's input:
+// Of a chunk of rows, with the sums of r, z and the candidate's input:
 //     r, z = sigmoid(sums), n = tanh(sum + r (W_hn h + b_hn)), h' = n + z (h - n)
 void gates(int rows, int h, const float* sums, const float* before, float* rz, float* n,
            const float* n_hidden, float* hidden) {
@@ -79,7 +79,7 @@ size_t unroll_tape(int rows, int hidden) { return static_cast<size_t>(rows) * 6 
 
 // q (rows x actions) of the packed rows; sizes[t] rows at time t. parameters: fc1.weight, fc1.bias,
 // rnn.weight_ih, rnn.weight_hh, rnn.bias_ih, rnn.bias_hh, fc2.weight, fc2.bias. Without a tape there
-// is no backward pass, and what it would need is written over with every tile.
+// is no backward pass, and what it would need is written over with every chunk.
 void unroll_forward(int times_, const int* sizes, int rows, int inputs, int hidden, int actions,
                     const float* x, const float* const* parameters, float* q, float* tape_) {
     const Net net(inputs, hidden, actions, parameters);
