@@ -68,6 +68,21 @@ def test_adaptive_moves_only_at_blocks() -> None:
     assert coach.rate == 0.0
 
 
+def test_patient_waits_for_a_block_and_never_again() -> None:
+    config = CoachConfig(strategy="patient", crash_rate=0.4, patient={"success": 0.8})
+    coach = Coach(config, TEAM, seed=0)
+    rates = [coach.record_block(success, NOWHERE).new_rate for success in (0.5, 0.79, 0.8, 0.0)]
+    assert rates == [0.0, 0.0, 0.4, 0.4]
+    fixed = Coach(CoachConfig(strategy="fixed", crash_rate=0.4), TEAM, seed=0)
+    assert [coach.plan(i).faults for i in range(200)] == [fixed.plan(i).faults for i in range(200)]
+
+
+def test_patient_crashes_nobody_before() -> None:
+    coach = Coach(CoachConfig(strategy="patient", crash_rate=0.9), TEAM, seed=0)
+    coach.record_block(0.7, NOWHERE)
+    assert not any(coach.plan(episode).faults for episode in range(200))
+
+
 @pytest.mark.parametrize(("steps", "rate"), [(0, 0.0), (250, 0.05), (500, 0.1), (1000, 0.1)])
 def test_curriculum_in_environment_steps(steps: int, rate: float) -> None:
     coach = Coach(CoachConfig(strategy="curriculum"), TEAM, seed=0)
@@ -116,9 +131,9 @@ def test_fixed_and_none() -> None:
 def test_what_a_strategy_reads() -> None:
     found = {name: find_strategy(name) for name in strategy_names()}
     assert {name for name, it in found.items() if it.needs_success} == {
-        "adaptive", "learnability", "failure",
+        "adaptive", "patient", "learnability", "failure",
     }  # fmt: skip
-    assert {name for name, it in found.items() if it.reads_blocks} == {"adaptive"}
+    assert {name for name, it in found.items() if it.reads_blocks} == {"adaptive", "patient"}
     assert {name for name, it in found.items() if not it.crashes} == {"none"}
 
 

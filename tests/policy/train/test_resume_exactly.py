@@ -134,10 +134,16 @@ def test_faults_with_memory_go_on_where_they_were(tmp_path: Path) -> None:
     assert 4 in replay["faults"]
 
 
-@pytest.mark.parametrize("strategy", ["curriculum", "deck", "learnability", "failure"])
+@pytest.mark.parametrize("strategy", ["curriculum", "patient", "deck", "learnability", "failure"])
 def test_a_strategys_state_goes_on_where_it_was(tmp_path: Path, strategy: str) -> None:
     """Killed by surprise between two checkpoints, with episodes under way."""
-    coach = {"strategy": strategy, "crash_mode": "random", "min_alive": 1}
+    coach = {
+        "strategy": strategy,
+        "crash_mode": "random",
+        "min_alive": 1,
+        "crash_rate": 0.5,
+        "patient": {"success": 0.0},  # it begins with the first block
+    }
     settings = {**CONFIG.model_dump(), "total_steps": 1200, "coach": coach}
     config = TrainConfig.model_validate(settings)
     train(config, tmp_path / "whole")
@@ -147,8 +153,8 @@ def test_a_strategys_state_goes_on_where_it_was(tmp_path: Path, strategy: str) -
     assert manifest.progress["env_steps"] == 800
     saved = manifest.training["coach"]["strategy"]
     assert set(saved) == {
-        "curriculum": {"rate"}, "deck": set(), "learnability": {"success", "counts"},
-        "failure": {"success", "counts"},
+        "curriculum": {"rate"}, "patient": {"begun"}, "deck": set(),
+        "learnability": {"success", "counts"}, "failure": {"success", "counts"},
     }[strategy]  # fmt: skip
     train(config, tmp_path / "run", resume=True)
     assert_same_run(tmp_path / "run", tmp_path / "whole")

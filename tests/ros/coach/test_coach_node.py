@@ -205,6 +205,23 @@ def test_adaptive_follows_complete_blocks_of_live_episodes(ros_env: dict[str, st
         assert rates == [0, 0, 0.25, 0.25, 0.4375, 0.4375, 0.328125]
 
 
+def test_patient_waits_for_a_block_of_live_episodes(ros_env: dict[str, str]) -> None:
+    settings = {
+        "strategy": "patient",
+        "patient.success": 1.0,
+        "crash_rate": 0.25,
+        "block_episodes": 2,
+    }
+    with process(ros_env, "coach", robots=ROBOTS, **settings), team(ros_env) as t:
+        t.meet(gate=False)
+        rates = []
+        for episode, success in enumerate([1, 0, 1, 1, 0, 0, 0]):
+            t.announce(episode, 0)
+            rates.append(plan_of(t, episode).rate)
+            t.announce(episode, 1, ended=True, success=bool(success))
+        assert rates == [0, 0, 0, 0, 0.25, 0.25, 0.25]
+
+
 def test_curriculum_follows_finished_episodes(ros_env: dict[str, str]) -> None:
     settings = {"strategy": "curriculum", "curriculum.alpha_max": 0.4, "curriculum.episodes": 4}
     with process(ros_env, "coach", robots=ROBOTS, **settings), team(ros_env) as t:

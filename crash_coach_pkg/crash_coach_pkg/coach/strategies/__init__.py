@@ -19,6 +19,7 @@ from crash_coach_pkg.coach.strategies.failure import Failure
 from crash_coach_pkg.coach.strategies.fixed import Fixed
 from crash_coach_pkg.coach.strategies.learnability import Learnability
 from crash_coach_pkg.coach.strategies.nobody import Nobody
+from crash_coach_pkg.coach.strategies.patient import Patient
 from crash_coach_pkg.faults import SYNONYMS, mode_names
 from crash_coach_pkg.faults.schema import ParameterInfo, number_fields
 
@@ -26,7 +27,7 @@ ENTRY_POINT_GROUP = "crash_coach.strategies"
 AnyStrategy = Strategy[Any]
 
 _BUILT_IN: tuple[type[AnyStrategy], ...] = (
-    Nobody, Fixed, Curriculum, Adaptive, Deck, Learnability, Failure,
+    Nobody, Fixed, Curriculum, Adaptive, Patient, Deck, Learnability, Failure,
 )  # fmt: skip
 _strategies: dict[str, type[AnyStrategy]] = {strategy.name: strategy for strategy in _BUILT_IN}
 _installed_read = False
