@@ -187,6 +187,18 @@ def test_an_injection_lasts_as_many_steps_as_asked_and_is_told_when_it_begins(
         assert g.team.step(0, 12)[1].faulted
 
 
+def live_rates(ros_env: dict[str, str], successes: list[int], **settings: object) -> list[float]:
+    """The crash rate of each episode's plan, for episodes that end so one after another."""
+    rates = []
+    with process(ros_env, "coach", robots=ROBOTS, **settings), team(ros_env) as t:
+        t.meet(gate=False)
+        for episode, success in enumerate(successes):
+            t.announce(episode, 0)
+            rates.append(plan_of(t, episode).rate)
+            t.announce(episode, 1, ended=True, success=bool(success))
+    return rates
+
+
 def test_adaptive_follows_complete_blocks_of_live_episodes(ros_env: dict[str, str]) -> None:
     settings = {
         "strategy": "adaptive",
@@ -194,15 +206,9 @@ def test_adaptive_follows_complete_blocks_of_live_episodes(ros_env: dict[str, st
         "adaptive.rho": 0.25,
         "block_episodes": 2,
     }
-    with process(ros_env, "coach", robots=ROBOTS, **settings), team(ros_env) as t:
-        t.meet(gate=False)
-        rates = []
-        for episode, success in enumerate([1, 1, 1, 0, 0, 0, 1]):
-            t.announce(episode, 0)
-            rates.append(plan_of(t, episode).rate)
-            t.announce(episode, 1, ended=True, success=bool(success))
-        # Blocks: (1, 1) -> .25, (1, 0) -> .4375, (0, 0) -> .328125
-        assert rates == [0, 0, 0.25, 0.25, 0.4375, 0.4375, 0.328125]
+    rates = live_rates(ros_env, [1, 1, 1, 0, 0, 0, 1], **settings)
+    # Blocks: (1, 1) -> .25, (1, 0) -> .4375, (0, 0) -> .328125
+    assert rates == [0, 0, 0.25, 0.25, 0.4375, 0.4375, 0.328125]
 
 
 def test_patient_waits_for_a_block_of_live_episodes(ros_env: dict[str, str]) -> None:
@@ -212,26 +218,14 @@ def test_patient_waits_for_a_block_of_live_episodes(ros_env: dict[str, str]) -> 
         "crash_rate": 0.25,
         "block_episodes": 2,
     }
-    with process(ros_env, "coach", robots=ROBOTS, **settings), team(ros_env) as t:
-        t.meet(gate=False)
-        rates = []
-        for episode, success in enumerate([1, 0, 1, 1, 0, 0, 0]):
-            t.announce(episode, 0)
-            rates.append(plan_of(t, episode).rate)
-            t.announce(episode, 1, ended=True, success=bool(success))
-        assert rates == [0, 0, 0, 0, 0.25, 0.25, 0.25]
+    rates = live_rates(ros_env, [1, 0, 1, 1, 0, 0, 0], **settings)
+    assert rates == [0, 0, 0, 0, 0.25, 0.25, 0.25]
 
 
 def test_curriculum_follows_finished_episodes(ros_env: dict[str, str]) -> None:
     settings = {"strategy": "curriculum", "curriculum.alpha_max": 0.4, "curriculum.episodes": 4}
-    with process(ros_env, "coach", robots=ROBOTS, **settings), team(ros_env) as t:
-        t.meet(gate=False)
-        rates = []
-        for episode in range(6):
-            t.announce(episode, 0)
-            rates.append(plan_of(t, episode).rate)
-            t.announce(episode, 1, ended=True)
-        assert rates == pytest.approx([0, 0.1, 0.2, 0.3, 0.4, 0.4])
+    rates = live_rates(ros_env, [0] * 6, **settings)
+    assert rates == pytest.approx([0, 0.1, 0.2, 0.3, 0.4, 0.4])
 
 
 @pytest.mark.parametrize(
