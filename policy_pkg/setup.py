@@ -15,6 +15,7 @@ setup(
         "policy_pkg.export",
         "policy_pkg.learner",
         "policy_pkg.learner.native",
+        "policy_pkg.native",
         "policy_pkg.play",
         "policy_pkg.report",
         "policy_pkg.ros",
@@ -29,8 +30,8 @@ setup(
         "policy_pkg": [
             "configs/**/*.yaml",
             "ros/*.xml",
-            "learner/native/*.cpp",
-            "learner/native/*.h",
+            "native/*.cpp",
+            "native/*.h",
         ]
     },
     data_files=[

@@ -26,7 +26,7 @@ VENV = ROOT / ".venv"
 PYTHON = VENV / "bin" / "python"
 STAMPS = VENV / ".crash_coach"
 WORKSPACE = ROOT / "ros_ws"
-KERNELS = ROOT / "policy_pkg/policy_pkg/learner/native"
+KERNELS = ROOT / "policy_pkg/policy_pkg/native"
 # Both give the same bits (the source says why): the learner takes the best its processor can run.
 KERNEL_FLAGS = {"avx2": ["-mavx2", "-mfma"], "avx512": ["-mavx512f", "-mavx2", "-mfma"]}
 KERNEL_OPTIONS = ["-std=c++17", "-O3", "-ffp-contract=off", "-fPIC", "-shared"]
@@ -204,16 +204,16 @@ def rewrite_cmake_paths() -> int:
 
 
 def build_kernels() -> None:
-    """The learner's kernels, for processors with and without AVX-512."""
+    """The compiled kernels, for processors with and without AVX-512."""
     folder = VENV / "lib" / "crash_coach"
     folder.mkdir(parents=True, exist_ok=True)
     for name, flags in KERNEL_FLAGS.items():
         # A new file: a training that runs has the old one open.
-        fresh = folder / f"learner_{name}.partial"
+        fresh = folder / f"kernels_{name}.partial"
         sources = map(str, sorted(KERNELS.glob("*.cpp")))
         command = ["c++", *KERNEL_OPTIONS, *flags, *sources, "-o", str(fresh)]
         run(command, VENV / "log" / "kernel.log")
-        os.replace(fresh, folder / f"learner_{name}.so")
+        os.replace(fresh, folder / f"kernels_{name}.so")
 
 
 def simulator_sources() -> list[Path]:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -44,9 +48,31 @@ def pytest_collection() -> Iterator[None]:
         return (yield)
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any, error: object) -> None:
+    """Says how a worker of pytest-xdist died: it tells only that one did."""
+    if error is None:
+        return
+    try:
+        code = node.gateway._io.popen.wait(timeout=10)
+    except subprocess.TimeoutExpired:
+        how = "it runs on, its pipe is closed"
+    else:
+        how = f"by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+    print(f"\n[{node.gateway.id}] how it ended: {how}", file=sys.stderr)
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
     if not hasattr(session.config, "workerinput"):  # once, before pytest-xdist's workers
         remove_left_behind()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def told_crashes() -> Iterator[None]:
+    """rclpy's executor has crashes told on a stderr that is captured by then: nobody saw them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(faulthandler, "enable", lambda *_, **__: None)  # pytest's own stays
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

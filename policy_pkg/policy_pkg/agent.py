@@ -6,9 +6,9 @@ the last answer, and the observations that wait for the rest of their step.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -41,8 +41,7 @@ class ObservationError(UserError):
     """An observation that this policy cannot have been trained for."""
 
 
-@dataclass(frozen=True, slots=True)
-class Sensed(Generic[Stamp]):
+class Sensed(NamedTuple, Generic[Stamp]):
     """One robot's observation. features: (O,) float32; available: (A,) 0 or 1."""
 
     episode: int
@@ -53,8 +52,7 @@ class Sensed(Generic[Stamp]):
     stamp: Stamp  # given back with the answer, untouched
 
 
-@dataclass(frozen=True, slots=True)
-class Answer(Generic[Stamp]):
+class Answer(NamedTuple, Generic[Stamp]):
     robot: int  # index among the agent's robots
     episode: int
     step: int
@@ -143,6 +141,8 @@ class Agent(Generic[Stamp]):
                 f"observation of {name}: expected {n_actions} available_actions, "
                 f"got {sensed.available.shape[0]}"
             )
+        if not sensed.available.tobytes().strip(b"\0"):
+            raise ObservationError(f"observation of {name}: no action is available")
         if not -1 <= sensed.last_action < n_actions:
             raise ObservationError(
                 f"observation of {name}: last_action {sensed.last_action} is not in "
@@ -179,10 +179,8 @@ class Agent(Generic[Stamp]):
             self._obs[rows], self._last_action[rows], self._index[rows], self._hidden[rows]
         )
         available = self._available[rows]
-        usable = np.isfinite(q).all(axis=1) & available.any(axis=1)
-        if not usable.all():
-            index = int(np.arange(len(self.robots))[rows][np.argmin(usable)])
-            self._refuse(index)
+        if not math.isfinite(q.sum()):  # one call of numpy's: a value is not, or all are huge
+            self._check_values(rows, q)
         self._hidden[rows] = hidden
         best = self._greedy(q, available)
         if self.exploration is not None:
@@ -190,14 +188,14 @@ class Agent(Generic[Stamp]):
             best = self.exploration.choose(best, available, self._index[rows], episode, step)
         return list(zip(best.tolist(), self._worst(q, available).tolist(), strict=True))
 
-    def _refuse(self, robot: int) -> None:
-        name = self.robots[robot]
-        if not self._available[robot].any():
-            raise ObservationError(f"observation of {name}: no action is available")
-        raise ObservationError(
-            f"observation of {name}: the action values are not finite; features "
-            f"{self._obs[robot].tolist()}"
-        )
+    def _check_values(self, rows: slice | npt.NDArray[np.intp], q: FloatArray) -> None:
+        usable = np.isfinite(q).all(axis=1)
+        if not usable.all():
+            robot = int(np.arange(len(self.robots))[rows][np.argmin(usable)])
+            raise ObservationError(
+                f"observation of {self.robots[robot]}: the action values are not finite; features "
+                f"{self._obs[robot].tolist()}"
+            )
 
     def _remember(
         self, robot: int, sensed: Sensed[Stamp], action: int, worst: int

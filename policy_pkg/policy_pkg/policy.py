@@ -1,6 +1,9 @@
-"""The agent network's forward pass in numpy: the one path that acts, in rollouts and on robots.
+"""The agent network's forward pass: the one path that acts, in rollouts and on robots.
 
-Linear - ReLU - GRU - Linear, shared by all robots, as PyMARL's ``RNNAgent``. BLAS is handed eight
+Linear - ReLU - GRU - Linear, shared by all robots, as PyMARL's ``RNNAgent``. Where set-up built
+kernels, one step is compiled (``native``), because each of numpy's some thirty calls costs several
+microseconds in a process that others' have driven out of the caches; it has the bits of what
+stands here where numpy uses OpenBLAS' kernels for Haswell. BLAS is handed eight
 rows at a time: how it sums depends on the number of rows and, with some of its kernels (Haswell's
 and Zen's), on a row's place among them, but not within eight. So a row's result does not depend,
 bit for bit, on how many rows are computed with it.
@@ -14,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from crash_coach_common.contract import FloatArray, IntArray
+from policy_pkg.native.acting import CompiledStep, compiled
 
 BLOCK_ROWS = 8
 WeightArrays = dict[str, npt.NDArray[np.float32]]
@@ -107,6 +111,7 @@ class RecurrentPolicy:
     ) -> None:
         self.sizes = check_weights(weights, n_robots, n_actions)
         self._buffers: dict[int, _Buffers] = {}
+        self._compiled: CompiledStep | None = None
         self._assign(weights)
 
     def set_weights(self, weights: dict[str, npt.NDArray[np.float32]]) -> None:
@@ -134,6 +139,15 @@ class RecurrentPolicy:
         self._b_hh = np.array(weights["rnn.bias_hh"], dtype=np.float32)
         self._w_out = np.array(weights["fc2.weight"].T, dtype=np.float32, order="C")
         self._b_out = np.array(weights["fc2.bias"], dtype=np.float32)
+        self._weights = {name: np.array(weights[name], dtype=np.float32) for name in WEIGHT_NAMES}
+        if self._compiled is None:
+            self._compiled = compiled(self._weights, self.sizes.robots, self.sizes.actions)
+        else:
+            self._compiled.set_weights(self._weights)
+
+    def __reduce__(self) -> tuple[type[RecurrentPolicy], tuple[WeightArrays, int, int]]:
+        """Goes to another process, which has a build or none, as its weights."""
+        return RecurrentPolicy, (self._weights, self.sizes.robots, self.sizes.actions)
 
     def initial_hidden(self, rows: int) -> FloatArray:
         """(rows, H) zeros: the hidden state at the start of an episode."""
@@ -158,6 +172,8 @@ class RecurrentPolicy:
         """
         rows = len(obs)
         self._check(obs, last_action, robot, hidden)
+        if self._compiled is not None:
+            return self._compiled.forward(obs, last_action, robot, hidden)
         buf = self._scratch(rows)
         buf.obs[:rows] = obs
         buf.hidden[:rows] = hidden

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from crash_coach_common.contract import UserError
+from policy_pkg import native
 from policy_pkg.episode import Sizes
-from policy_pkg.learner import native
 from policy_pkg.learner.agent_net import AgentNet
 from policy_pkg.policy import weight_shapes
 

@@ -29,9 +29,9 @@ from crash_coach_common.contract import UserError
 from crash_coach_common.locks import TakenError, held
 from crash_coach_common.strict_yaml import ConfigError
 from crash_coach_common.whole_output import write_whole
+from policy_pkg import native
 from policy_pkg.checkpoint import CHECKPOINTS, PolicyBundle, list_checkpoints
 from policy_pkg.kernels import kernels
-from policy_pkg.learner import native
 from policy_pkg.train.config import TrainConfig
 from policy_pkg.train.offline.config import OfflineConfig
 from sim_pkg.env import ScenarioLike

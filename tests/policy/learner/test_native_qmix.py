@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from policy_pkg import native
 from policy_pkg.episode import Sizes
-from policy_pkg.learner import native
 from policy_pkg.learner.config import LearnerConfig
 from policy_pkg.learner.mixer import Qmix
 

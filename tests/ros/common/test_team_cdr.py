@@ -69,6 +69,18 @@ def test_others_robots_are_left_out() -> None:
     assert (only[0], deserialize_message(only[1], Observation)) == (0, observation(2))
 
 
+def test_only_what_stands_up_to_the_last_of_ours_is_read() -> None:
+    joined = OBSERVATIONS.codec(ROBOTS).join(serialized([0, 1, 2, 3], observation))
+    upto = OBSERVATIONS.codec(ROBOTS).join(serialized([0, 1, 2], observation))
+    behind = len(joined) - len(upto)
+    for reader in (OBSERVATIONS.codec(("rover", "robot_3")), OBSERVATIONS.codec(("robot_3",))):
+        whole = reader.split(joined)
+        assert [robot for robot, _ in whole] == list(range(len(whole)))
+        assert reader.split(joined[: len(joined) - behind // 2]) == whole
+        with pytest.raises(UserError, match="is cut short"):
+            reader.split(joined[: len(joined) - behind - 8])
+
+
 def test_other_bytes_are_refused() -> None:
     codec = COMMANDS.codec(ROBOTS)
     joined = codec.join(serialized([0, 1, 2], action))

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from policy_pkg.learner import native
+from policy_pkg import native
 from policy_pkg.learner.memory import room
 
 Tape = npt.NDArray[np.float32]

@@ -86,6 +86,7 @@ class TeamCodec:
         self._end = end
         self._written: dict[tuple[int, ...], bytes] = {}  # what stands before some robots' messages
         self._read: tuple[bytes, list[int | None]] = (b"", [])
+        self._behind_ours = 0  # so many messages of such a one hold all of ours
 
     def join(self, messages: Sequence[RobotMessage]) -> bytes:
         """One message of several, each with its robot."""
@@ -104,7 +105,8 @@ class TeamCodec:
         """The messages of those robots that are ours.
 
         Raises:
-            UserError: not little-endian CDR, cut short, or not one message for each name.
+            UserError: not little-endian CDR, cut short up to the last of ours, or not one message
+                for each name.
         """
         if data[:2] != LITTLE_ENDIAN:
             raise UserError(
@@ -113,7 +115,7 @@ class TeamCodec:
         found: list[RobotMessage] = []
         try:
             robots, end = self._robots_of(data)
-            for robot in robots:
+            for robot in robots[: self._behind_ours]:
                 at = _aligned(end)
                 end = self._end(data, at)
                 if robot is not None:
@@ -140,6 +142,8 @@ class TeamCodec:
             robots = [self._index.get(name) for name in found]
             names = data[ENCAPSULATION_SIZE:end]
             self._read = names, robots
+            ours = [place for place, robot in enumerate(robots) if robot is not None]
+            self._behind_ours = ours[-1] + 1 if ours else 0
         end = ENCAPSULATION_SIZE + len(names)
         (count,) = COUNT.unpack_from(data, end)
         if count != len(robots):

@@ -19,12 +19,13 @@ from rclpy.experimental import EventsExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 
 from crash_coach_common.caches import settle_caches
 from crash_coach_common.contract import UserError
 from crash_coach_common.ros.qos_node import tell_unused
 
-SPIN_S = 0.1  # how soon a signal is noticed
+SPIN_S = 0.1  # how soon a signal or an end is noticed
 TICK_S = 0.05  # steady timers for leases and heartbeats
 RCLError: type[Exception] = rclpy_implementation.RCLError  # bad --ros-args, for one
 
@@ -83,11 +84,13 @@ class Serving:
         return node
 
     def until(self, done: Callable[[], object]) -> None:
-        """Serves until ``done()``, which may raise what went wrong."""
+        """Serves until ``done()``, asked every SPIN_S, which may raise what went wrong."""
         tell_unused(self._nodes)
         gc.freeze()  # what was loaded so far stays: no collection need look at it again
+        never: Future[None] = Future(executor=self.executor)
         while not done():
-            self.executor.spin_once(timeout_sec=SPIN_S)
+            # Many callbacks at a time: between two of them nothing of Python's runs.
+            self.executor.spin_until_future_complete(never, timeout_sec=SPIN_S)
 
     def close(self) -> None:
         # In this order: DDS must not call back into what is gone (the executor first lets go).

@@ -148,7 +148,7 @@ def subscribe(
     on_messages: Callable[[list[RobotMessage]], None],
     on_error: Callable[[UserError], None],
     lockstep: bool,
-    on_whole: Callable[[bytes, int], bool] = lambda data, at: False,
+    on_whole: Callable[[bytes, int], bool] | None = None,
 ) -> list[Any]:
     """Subscribes to robots' ``topics`` and, within NAMESPACE, to the team's topic ``name``.
 
@@ -166,9 +166,10 @@ def subscribe(
 
     def on_team(data: bytes) -> None:
         try:
-            at = codec.begin_of_all(data)
-            if at is not None and on_whole(data, at):
-                return
+            if on_whole is not None:
+                at = codec.begin_of_all(data)
+                if at is not None and on_whole(data, at):
+                    return
             messages = codec.split(data)
         except UserError as error:
             on_error(error)
