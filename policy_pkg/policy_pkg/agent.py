@@ -32,6 +32,9 @@ class Policy(Protocol):
 class Explorer(Protocol):
     """What the agent needs of policy_pkg.act.Exploration."""
 
+    @property
+    def epsilon(self) -> float: ...
+
     def choose(
         self, best: IntArray, available: BoolArray, robots: IntArray, episode: int, step: int
     ) -> IntArray: ...
@@ -77,8 +80,7 @@ class Agent(Generic[Stamp]):
         robots: Sequence[str],
         obs_size: int,
         n_actions: int,
-        greedy: Callable[[FloatArray, BoolArray], IntArray],
-        worst: Callable[[FloatArray, BoolArray], IntArray],
+        best_and_worst: Callable[[FloatArray, BoolArray], list[tuple[int, int]]],
     ) -> None:
         """Raises UserError for a robot that is not of the team."""
         for name in robots:
@@ -92,8 +94,7 @@ class Agent(Generic[Stamp]):
         self.exploration: Explorer | None = None
         """Replaces some of the best actions; None: never."""
         self._policy = policy
-        self._greedy = greedy
-        self._worst = worst
+        self._best_and_worst = best_and_worst
         n = len(self.robots)
         self._index = np.array([list(team).index(name) for name in self.robots], dtype=np.int32)
         self._obs = np.zeros((n, obs_size), dtype=np.float32)
@@ -182,11 +183,12 @@ class Agent(Generic[Stamp]):
         if not math.isfinite(q.sum()):  # one call of numpy's: a value is not, or all are huge
             self._check_values(rows, q)
         self._hidden[rows] = hidden
-        best = self._greedy(q, available)
-        if self.exploration is not None:
-            episode, step = self._waiting_key
-            best = self.exploration.choose(best, available, self._index[rows], episode, step)
-        return list(zip(best.tolist(), self._worst(q, available).tolist(), strict=True))
+        chosen = self._best_and_worst(q, available)
+        if self.exploration is None or self.exploration.epsilon <= 0:
+            return chosen
+        best = np.array([action for action, _ in chosen], dtype=np.int32)
+        best = self.exploration.choose(best, available, self._index[rows], *self._waiting_key)
+        return [(action, worst) for action, (_, worst) in zip(best.tolist(), chosen, strict=True)]
 
     def _check_values(self, rows: slice | npt.NDArray[np.intp], q: FloatArray) -> None:
         usable = np.isfinite(q).all(axis=1)

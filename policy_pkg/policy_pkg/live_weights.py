@@ -10,7 +10,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load
 
 from crash_coach_common.contract import UserError
-from policy_pkg.act import Exploration, greedy, least_valued
+from policy_pkg.act import Exploration, best_and_worst
 from policy_pkg.agent import Agent
 from policy_pkg.policy import RecurrentPolicy, WeightArrays, check_weights
 
@@ -87,8 +87,7 @@ class LiveAgent(Generic[Stamp]):
             robots or first.robots,
             first.obs_size,
             first.n_actions,
-            greedy,
-            least_valued,
+            best_and_worst,
         )
         self.agent.exploration = first.exploration
         self._held: list[Weights] = []  # for later episodes, in the order of their arrival

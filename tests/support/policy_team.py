@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from crash_coach_common.contract import EnvSpec
-from policy_pkg.act import greedy, least_valued
+from policy_pkg.act import best_and_worst
 from policy_pkg.agent import Agent, Answer, Sensed
 from policy_pkg.checkpoint import PolicyBundle
 
@@ -37,4 +37,4 @@ def actions(answers: list[Answer[str]]) -> list[int]:
 
 
 def make_agent(bundle: PolicyBundle, robots: tuple[str, ...] = SPEC.robots) -> Agent[str]:
-    return Agent(bundle.policy, bundle.robots, robots, OBS, ACTIONS, greedy, least_valued)
+    return Agent(bundle.policy, bundle.robots, robots, OBS, ACTIONS, best_and_worst)

@@ -12,7 +12,7 @@ from crash_coach_common.ros.qos_node import QosNode
 from crash_coach_common.ros.run_node import run, serving
 from crash_coach_common.ros.team_topics import COMMANDS, OBSERVATIONS, TeamPublisher, subscribe
 from crash_coach_common.team_cdr import RobotMessage
-from policy_pkg.act import Exploration, greedy, least_valued
+from policy_pkg.act import Exploration, best_and_worst
 from policy_pkg.agent import Agent, Answer
 from policy_pkg.checkpoint import load_policy
 from policy_pkg.ros.agent_params import PolicyParameters, TeamParameters, read_parameters
@@ -104,8 +104,7 @@ def make_agent(
             robots or bundle.robots,
             bundle.obs_size,
             bundle.n_actions,
-            greedy,
-            least_valued,
+            best_and_worst,
         )
     agent.exploration = Exploration(parameters.epsilon, seed, n_robots)
     return agent

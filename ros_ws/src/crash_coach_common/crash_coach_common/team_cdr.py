@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
 
 from crash_coach_common.cdr import (
     COMMANDED,
@@ -70,6 +71,14 @@ def common_step(data: bytes, at: int, count: int) -> tuple[int, int] | None:
     return (episode, step) if faults == bytes(count) else None
 
 
+class _Named(NamedTuple):
+    """Whose messages one of several is."""
+
+    names: bytes  # string[], padded
+    robots: list[int | None]  # None: nobody's of ours
+    upto_ours: int  # so many of the messages hold all of ours
+
+
 class TeamCodec:
     """Joins and splits the messages of ``robots``.
 
@@ -85,8 +94,10 @@ class TeamCodec:
         self._index = {name: index for index, name in enumerate(robots)}
         self._end = end
         self._written: dict[tuple[int, ...], bytes] = {}  # what stands before some robots' messages
-        self._read: tuple[bytes, list[int | None]] = (b"", [])
-        self._behind_ours = 0  # so many messages of such a one hold all of ours
+        self._read = _Named(b"", [], 0)
+        # Robots that are processes of their own take turns.
+        alone = [_Named(_names([name]), [index], 1) for index, name in enumerate(self._robots)]
+        self._alone = {named.names: named for named in alone}
 
     def join(self, messages: Sequence[RobotMessage]) -> bytes:
         """One message of several, each with its robot."""
@@ -114,8 +125,8 @@ class TeamCodec:
             )
         found: list[RobotMessage] = []
         try:
-            robots, end = self._robots_of(data)
-            for robot in robots[: self._behind_ours]:
+            named, end = self._named(data)
+            for robot in named.robots[: named.upto_ours]:
                 at = _aligned(end)
                 end = self._end(data, at)
                 if robot is not None:
@@ -129,26 +140,31 @@ class TeamCodec:
     def begin_of_all(self, data: bytes) -> int | None:
         """Where the messages begin in one of all robots, in their order; None for any other."""
         try:
-            robots, at = self._robots_of(data)
+            if COUNT.unpack_from(data, ENCAPSULATION_SIZE) != (len(self._all),):
+                return None
+            named, at = self._named(data)
         except (UserError, struct.error, UnicodeDecodeError):
             return None  # for ``split`` to say what is wrong
-        return at if robots == self._all and data[:2] == LITTLE_ENDIAN else None
+        return at if named.robots == self._all and data[:2] == LITTLE_ENDIAN else None
 
-    def _robots_of(self, data: bytes) -> tuple[list[int | None], int]:
-        """Whose messages these are (None: nobody's of ours), and where their number ends."""
-        names, robots = self._read
-        if not names or not data.startswith(names, ENCAPSULATION_SIZE):
-            found, end = _names_of(data, ENCAPSULATION_SIZE)
-            robots = [self._index.get(name) for name in found]
-            names = data[ENCAPSULATION_SIZE:end]
-            self._read = names, robots
-            ours = [place for place, robot in enumerate(robots) if robot is not None]
-            self._behind_ours = ours[-1] + 1 if ours else 0
-        end = ENCAPSULATION_SIZE + len(names)
+    def _named(self, data: bytes) -> tuple[_Named, int]:
+        """Whose messages these are, and where their number ends."""
+        named = self._read
+        if not named.names or not data.startswith(named.names, ENCAPSULATION_SIZE):
+            named = self._alone.get(_first_name(data)) or self._names_read(data)
+        end = ENCAPSULATION_SIZE + len(named.names)
         (count,) = COUNT.unpack_from(data, end)
-        if count != len(robots):
-            raise UserError(f"{self._what}: {count} messages for {len(robots)} robots")
-        return robots, end + COUNT.size
+        if count != len(named.robots):
+            raise UserError(f"{self._what}: {count} messages for {len(named.robots)} robots")
+        return named, end + COUNT.size
+
+    def _names_read(self, data: bytes) -> _Named:
+        found, end = _names_of(data, ENCAPSULATION_SIZE)
+        robots = [self._index.get(name) for name in found]
+        ours = [place for place, robot in enumerate(robots) if robot is not None]
+        upto_ours = ours[-1] + 1 if ours else 0
+        self._read = _Named(data[ENCAPSULATION_SIZE:end], robots, upto_ours)
+        return self._read
 
 
 def _names(names: Iterable[str]) -> bytes:
@@ -158,6 +174,13 @@ def _names(names: Iterable[str]) -> bytes:
     for text in encoded:
         parts += [COUNT.pack(len(text)), text, bytes(-len(text) & 3)]
     return b"".join(parts)
+
+
+def _first_name(data: bytes) -> bytes:
+    """``names`` of a message of one robot; of others' the beginning of that."""
+    at = ENCAPSULATION_SIZE + COUNT.size
+    (length,) = COUNT.unpack_from(data, at)
+    return data[ENCAPSULATION_SIZE : at + COUNT.size + _aligned(length)]
 
 
 def _names_of(data: bytes, at: int) -> tuple[list[str], int]:
