@@ -271,6 +271,29 @@ def test_writes_both_pictures_and_the_figures(
     assert not list(tmp_path.glob("*.partial"))
 
 
+def test_the_right_end_is_told_of_every_seed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = []
+    for seed, end in enumerate((0.5, 0.7)):
+        run = write_run(tmp_path / f"qmix-s{seed}", seed, (1.0, 0.0, *[end] * 10), range(12))
+        rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+        for row in rows:
+            row["success_crash_free"] = row["success_rate"]
+        rows[-1]["success_crash_free"] = end + 0.1
+        (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+        runs.append(run)
+    plot(runs, tmp_path / "curves", tmp_path / "curves.json")
+    told = "last 10 blocks: crash-free 61.0 ± 14.1 % (51.0, 71.0)"
+    assert told in capsys.readouterr().out
+    (group,) = json.loads((tmp_path / "curves.json").read_text())["groups"]
+    assert group["last_blocks"]["count"] == 10
+    assert group["last_blocks"]["success_percent"]["success_crash_free"] == pytest.approx([51, 71])
+    short = write_run(tmp_path / "short-s0", 0, (0.5,) * 9, range(9))
+    plot([short], tmp_path / "short")
+    assert "last 10 blocks" not in capsys.readouterr().out
+
+
 def test_out(tmp_path: Path) -> None:
     assert targets(tmp_path / "a.png") == targets(tmp_path / "a")
     (tmp_path / "file").touch()

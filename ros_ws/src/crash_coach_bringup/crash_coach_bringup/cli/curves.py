@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from crash_coach_bringup.cli.output import CliError
 from policy_pkg.report.finished_runs import KEPT_BESIDE, read_text, todays_config
+from policy_pkg.report.training import LAST_BLOCKS
 from policy_pkg.train.metrics import crashed_robot
 from policy_pkg.train.run_dir import METRICS, RUN, read_run, seedless_name
 
@@ -270,6 +271,14 @@ def average(group: Group, key: str) -> Curve | None:
     if group.band == RANGE:
         return Curve(grid, rows.mean(axis=0), rows.min(axis=0), rows.max(axis=0))
     return Curve(grid, rows.mean(axis=0), *bootstrap_mean(rows))
+
+
+def last_blocks(group: Group, key: str) -> list[float] | None:
+    """Of each run the mean over its last LAST_BLOCKS blocks; None where one has fewer with it."""
+    measured = [run.values[key][~np.isnan(run.values[key])] for run in group.runs]
+    if min(map(len, measured)) < LAST_BLOCKS:
+        return None
+    return [float(np.mean(values[-LAST_BLOCKS:])) for values in measured]
 
 
 def bootstrap_mean(rows: Floats) -> tuple[Floats, Floats]:

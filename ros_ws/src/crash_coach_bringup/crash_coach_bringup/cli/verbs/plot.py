@@ -17,6 +17,7 @@ from crash_coach_bringup.cli.curves import (
     Kind,
     average,
     group_runs,
+    last_blocks,
     load_run,
 )
 from crash_coach_bringup.cli.figure_style import (
@@ -34,6 +35,7 @@ from crash_coach_bringup.cli.output import (
     written_first,
 )
 from policy_pkg.report.finished_runs import read_text, runs_below
+from policy_pkg.report.training import LAST_BLOCKS
 from policy_pkg.train.run_dir import METRICS, RUN
 
 if TYPE_CHECKING:
@@ -50,6 +52,11 @@ TITLES = {
     "loss": "loss: what a gradient step lowers",
 }
 PROBABILITIES = {"success_rate", "success_crash_free", "success_1_crashed", EACH_CRASHED}
+ENDS = {  # what the right end of a curve is told of
+    "success_crash_free": "crash-free",
+    "success_1_crashed": "one robot crashed",
+    EACH_CRASHED: "each robot crashed alone",
+}
 WIDE_LABEL = 50  # characters from which two columns of the legend would not fit
 
 Curves = dict[str, Curve | None]
@@ -151,6 +158,22 @@ def note(group: Group) -> str | None:
     )
 
 
+def ends(group: Group) -> dict[str, list[float]]:
+    """Of each run the success in its last LAST_BLOCKS blocks, by curve, in percent."""
+    found = {key: last_blocks(group, key) for key in group.runs[0].kind.curves if key in ENDS}
+    return {key: [100 * rate for rate in rates] for key, rates in found.items() if rates}
+
+
+def told_ends(group: Group) -> str | None:
+    """'last 10 blocks: crash-free 98.6 ± 1.1 % (97.5, 99.8)'; None where there are fewer."""
+    told = []
+    for key, rates in ends(group).items():
+        spread = f" ± {np.std(rates, ddof=1):.1f} %" if len(rates) > 1 else " %"
+        each = f" ({', '.join(f'{rate:.1f}' for rate in rates)})" if len(rates) > 1 else ""
+        told.append(f"{ENDS[key]} {np.mean(rates):.1f}{spread}{each}")
+    return f"last {LAST_BLOCKS} blocks: {'; '.join(told)}" if told else None
+
+
 def targets(stem: Path) -> dict[str, Path]:
     """Format -> file. A stem that names one of the formats already is taken without it.
 
@@ -172,6 +195,7 @@ def as_json(group: Group, curves: Curves) -> dict[str, Any]:
         "label": group.label,
         "band": group.band,
         "config": dict(group.runs[0].config),
+        "last_blocks": {"count": LAST_BLOCKS, "success_percent": ends(group)},
         "runs": [
             {
                 "path": str(run.path),
@@ -232,7 +256,7 @@ def plot(
     with written_first(json, result):
         for group in groups:
             console.print(legend(group), markup=False, highlight=False, soft_wrap=True)
-            if text := note(group):
+            for text in filter(None, (note(group), told_ends(group))):
                 console.print(f"  {text}", markup=False, highlight=False, soft_wrap=True)
         for kind, path in files.items():
             save(figure, path, kind)
