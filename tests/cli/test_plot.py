@@ -280,11 +280,15 @@ def test_the_right_end_is_told_of_every_seed(
         rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
         for row in rows:
             row["success_crash_free"] = row["success_rate"]
+            row |= {"success_robot_1_crashed": 0.4, "success_robot_2_crashed": end - 0.3}
         rows[-1]["success_crash_free"] = end + 0.1
         (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
         runs.append(run)
     plot(runs, tmp_path / "curves", tmp_path / "curves.json")
-    told = "last 10 blocks: crash-free 61.0 ± 14.1 % (51.0, 71.0)"
+    told = (
+        "last 10 blocks: crash-free 61.0 ± 14.1 % (51.0, 71.0); each robot crashed alone 35.0 ± "
+        "7.1 % (30.0, 40.0); the one that costs most 30.0 ± 14.1 % (20.0, 40.0)"
+    )
     assert told in capsys.readouterr().out
     (group,) = json.loads((tmp_path / "curves.json").read_text())["groups"]
     assert group["last_blocks"]["count"] == 10

@@ -132,6 +132,7 @@ def load_run(path: Path) -> Run:
         if not isinstance(value, int) or value < least:
             raise CliError(f"{path / RUN}: config.{key} is {value!r}, not a number from {least} on")
     rows = _read_metrics(path / METRICS, kind)
+    keys = [*kind.curves, *filter(crashed_robot, rows[-1])]
     return Run(
         path,
         kind,
@@ -143,7 +144,7 @@ def load_run(path: Path) -> Run:
         "" if data is None else data["sha256"],
         config["seed"],
         np.array([row[kind.steps] for row in rows]),
-        {key: np.array([row[key] for row in rows]) for key in kind.curves},
+        {key: np.array([row.get(key, math.nan) for row in rows]) for key in keys},
     )
 
 
@@ -168,7 +169,8 @@ def _read_metrics(path: Path, kind: Kind) -> list[dict[str, float]]:
 
 
 def _read_line(line: str, place: str, kind: Kind) -> dict[str, float]:
-    """The drawn figures of a line; null becomes NaN, except for the steps."""
+    """The drawn figures of a line, and those of each robot crashed alone; null becomes NaN, except
+    for the steps."""
     try:
         content = json.loads(line)
     except json.JSONDecodeError as error:
@@ -177,8 +179,8 @@ def _read_line(line: str, place: str, kind: Kind) -> dict[str, float]:
         raise CliError(
             f"{place}: damaged line: expected an object with {kind.steps} and other figures"
         )
-    row = {}
-    content[EACH_CRASHED] = _each_crashed(content)
+    row = _each_robot_crashed(content)
+    content[EACH_CRASHED] = sum(row.values()) / len(row) if row else None
     for key in (kind.steps, *kind.curves):
         if key not in content and key not in kind.optional:
             raise CliError(f"{place}: damaged line: {key} is missing")
@@ -192,14 +194,13 @@ def _read_line(line: str, place: str, kind: Kind) -> dict[str, float]:
     return row
 
 
-def _each_crashed(content: Mapping[str, Any]) -> float | None:
-    """None where the run's blocks do not crash each robot alone."""
-    found = [
-        float(value)
+def _each_robot_crashed(content: Mapping[str, Any]) -> dict[str, float]:
+    """Empty where the run's blocks do not crash each robot alone."""
+    return {
+        key: float(value)
         for key, value in content.items()
         if crashed_robot(key) and isinstance(value, int | float)
-    ]
-    return sum(found) / len(found) if found else None
+    }
 
 
 def group_runs(runs: Sequence[Run]) -> list[Group]:
@@ -279,6 +280,19 @@ def last_blocks(group: Group, key: str) -> list[float] | None:
     if min(map(len, measured)) < LAST_BLOCKS:
         return None
     return [float(np.mean(values[-LAST_BLOCKS:])) for values in measured]
+
+
+def worst_victim(group: Group) -> list[float] | None:
+    """As ``last_blocks``, of the robot whose crash alone costs each run most; None where runs do
+    not crash each robot alone."""
+    worst = []
+    for run in group.runs:
+        each = (last_blocks(Group("", (run,)), key) for key in filter(crashed_robot, run.values))
+        rates = [found[0] for found in each if found]
+        if not rates:
+            return None
+        worst.append(min(rates))
+    return worst
 
 
 def bootstrap_mean(rows: Floats) -> tuple[Floats, Floats]:

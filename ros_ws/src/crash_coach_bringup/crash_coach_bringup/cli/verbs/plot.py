@@ -19,6 +19,7 @@ from crash_coach_bringup.cli.curves import (
     group_runs,
     last_blocks,
     load_run,
+    worst_victim,
 )
 from crash_coach_bringup.cli.figure_style import (
     FORMATS,
@@ -52,10 +53,12 @@ TITLES = {
     "loss": "loss: what a gradient step lowers",
 }
 PROBABILITIES = {"success_rate", "success_crash_free", "success_1_crashed", EACH_CRASHED}
+WORST = "success_worst_victim"
 ENDS = {  # what the right end of a curve is told of
     "success_crash_free": "crash-free",
     "success_1_crashed": "one robot crashed",
     EACH_CRASHED: "each robot crashed alone",
+    WORST: "the one that costs most",
 }
 WIDE_LABEL = 50  # characters from which two columns of the legend would not fit
 
@@ -161,6 +164,7 @@ def note(group: Group) -> str | None:
 def ends(group: Group) -> dict[str, list[float]]:
     """Of each run the success in its last LAST_BLOCKS blocks, by curve, in percent."""
     found = {key: last_blocks(group, key) for key in group.runs[0].kind.curves if key in ENDS}
+    found[WORST] = worst_victim(group)
     return {key: [100 * rate for rate in rates] for key, rates in found.items() if rates}
 
 
