@@ -17,6 +17,7 @@ from crash_coach_bringup.cli.verbs import doctor
 from crash_coach_bringup.cli.verbs.train import plan_jobs
 from crash_coach_bringup.ros.probe import find_executable
 from crash_coach_bringup.ros.shared_memory import half_made
+from policy_pkg import native
 from policy_pkg.untrained import write_untrained
 from sim_pkg.env import make_env
 
@@ -297,6 +298,23 @@ def test_doctor_names_a_segment_that_a_killed_node_left_half_made(
     finding = doctor.shared_memory()
     assert not finding.ok
     assert f"rm {left[0]} {left[1]}" in finding.hint
+
+
+def test_doctor_says_what_acts_and_learns(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for asked, ok, found in (
+        ("", True, native.build_name()),
+        (native.TORCH, True, "none, as CRASH_COACH_KERNEL asks"),
+        ("fast", False, "none"),
+    ):
+        monkeypatch.setenv(native.VARIABLE, asked)
+        finding = doctor.compiled_kernels()
+        assert (finding.ok, finding.found) == (ok, found)
+    assert "CRASH_COACH_KERNEL=fast" in finding.hint
+    monkeypatch.setenv(native.VARIABLE, "")
+    monkeypatch.setattr(native, "FOLDER", tmp_path)
+    finding = doctor.compiled_kernels()
+    assert (finding.ok, finding.found) == (False, "none")
+    assert "make setup" in finding.hint
 
 
 def test_doctor_names_what_is_missing(tmp_path: Path) -> None:

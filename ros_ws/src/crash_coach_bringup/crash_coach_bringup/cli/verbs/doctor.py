@@ -17,6 +17,8 @@ import typer
 from crash_coach_bringup.cli.output import check_json_target, console, table, written_first
 from crash_coach_bringup.ros.shared_memory import SHARED_MEMORY, half_made
 from crash_coach_common.caches import places
+from crash_coach_common.contract import UserError
+from policy_pkg import native
 from policy_pkg.kernels import SAME_EVERYWHERE, kernels
 
 LIBRARIES = ("numpy", "numba", "pymunk", "torch", "safetensors", "pydantic", "matplotlib")
@@ -66,6 +68,18 @@ def blas_kernels() -> Finding:
         )
     )
     return Finding("BLAS kernels", found == wanted, found or "not OpenBLAS", hint)
+
+
+def compiled_kernels() -> Finding:
+    check, asked = "compiled kernels", os.environ.get(native.VARIABLE)
+    try:
+        build = native.build_name()
+    except UserError as error:
+        return Finding(check, False, "none", str(error))
+    if build or asked == native.TORCH:
+        return Finding(check, True, build or f"none, as {native.VARIABLE} asks")
+    hint = "numpy acts and torch learns, slower: run 'make setup' (needs AVX2)"
+    return Finding(check, False, "none", hint)
 
 
 def caches() -> Finding:
@@ -137,7 +151,8 @@ def dds() -> Finding:
 
 def examine() -> list[Finding]:
     """Every check; those that need ROS only where ROS was found."""
-    findings = [python_version(), compiler(), disk(), threads(), blas_kernels(), caches()]
+    findings = [python_version(), compiler(), disk(), threads(), blas_kernels()]
+    findings += [compiled_kernels(), caches()]
     findings += [library(name) for name in LIBRARIES]
     findings += [underlay(), interfaces()]
     need_ros: list[Callable[[], Finding]] = [executables, shared_memory]
