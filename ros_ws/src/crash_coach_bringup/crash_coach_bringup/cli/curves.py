@@ -287,7 +287,8 @@ def worst_victim(group: Group) -> list[float] | None:
     not crash each robot alone."""
     worst = []
     for run in group.runs:
-        each = (last_blocks(Group("", (run,)), key) for key in filter(crashed_robot, run.values))
+        robots = [key for key in run.values if crashed_robot(key) and key != EACH_CRASHED]
+        each = (last_blocks(Group("", (run,)), key) for key in robots)
         rates = [found[0] for found in each if found]
         if not rates:
             return None
