@@ -27,7 +27,7 @@ PYTHON = VENV / "bin" / "python"
 STAMPS = VENV / ".crash_coach"
 WORKSPACE = ROOT / "ros_ws"
 KERNELS = ROOT / "policy_pkg/policy_pkg/native"
-# Both give the same bits (the source says why): the learner takes the best its processor can run.
+# Both give the same bits (the source says why): acting and learning take the best that runs here.
 KERNEL_FLAGS = {"avx2": ["-mavx2", "-mfma"], "avx512": ["-mavx512f", "-mavx2", "-mfma"]}
 KERNEL_OPTIONS = ["-std=c++17", "-O3", "-ffp-contract=off", "-fPIC", "-shared"]
 LOCK = ROOT / "requirements.lock"
@@ -278,7 +278,7 @@ def main() -> int:
                     path for path in sorted(KERNELS.iterdir()) if path.suffix in (".h", ".cpp")
                 ]
                 kernels = fingerprint([base, *sources, *KERNEL_OPTIONS, str(KERNEL_FLAGS)])
-                stage("kernel", "learner's kernels", kernels, build_kernels)
+                stage("kernel", "compiled kernels", kernels, build_kernels)
             build = fingerprint([packages, *workspace_sources()])
             loops = fingerprint([packages, *simulator_sources()])
             with ThreadPoolExecutor() as beside:

@@ -2,7 +2,7 @@
 
 Linear - ReLU - GRU - Linear, shared by all robots, as PyMARL's ``RNNAgent``. Where set-up built
 kernels, one step is compiled (``native``), because each of numpy's some thirty calls costs several
-microseconds in a process that others' have driven out of the caches; it has the bits of what
+microseconds in a process that others have driven out of the caches; it has the bits of what
 stands here where numpy uses OpenBLAS' kernels for Haswell. BLAS is handed eight
 rows at a time: how it sums depends on the number of rows and, with some of its kernels (Haswell's
 and Zen's), on a row's place among them, but not within eight. So a row's result does not depend,
@@ -125,7 +125,17 @@ class RecurrentPolicy:
             raise ValueError(f"weights of sizes {sizes}, this policy has {self.sizes}")
         self._assign(weights)
 
-    def _assign(self, weights: dict[str, npt.NDArray[np.float32]]) -> None:
+    def _assign(self, weights: WeightArrays) -> None:
+        self._weights = {name: np.array(weights[name], dtype=np.float32) for name in WEIGHT_NAMES}
+        if self._compiled is not None:
+            self._compiled.set_weights(self._weights)
+            return
+        self._compiled = compiled(self._weights, self.sizes.robots, self.sizes.actions)
+        if self._compiled is None:
+            self._lay_out(self._weights)
+
+    def _lay_out(self, weights: WeightArrays) -> None:
+        """As numpy wants them."""
         obs, actions = self.sizes.obs, self.sizes.actions
         first = np.asarray(weights["fc1.weight"], dtype=np.float32)
         self._w_obs = np.array(first[:, :obs].T, order="C")
@@ -139,11 +149,6 @@ class RecurrentPolicy:
         self._b_hh = np.array(weights["rnn.bias_hh"], dtype=np.float32)
         self._w_out = np.array(weights["fc2.weight"].T, dtype=np.float32, order="C")
         self._b_out = np.array(weights["fc2.bias"], dtype=np.float32)
-        self._weights = {name: np.array(weights[name], dtype=np.float32) for name in WEIGHT_NAMES}
-        if self._compiled is None:
-            self._compiled = compiled(self._weights, self.sizes.robots, self.sizes.actions)
-        else:
-            self._compiled.set_weights(self._weights)
 
     def __reduce__(self) -> tuple[type[RecurrentPolicy], tuple[WeightArrays, int, int]]:
         """Goes to another process, which has a build or none, as its weights."""

@@ -7,10 +7,11 @@ from copy import deepcopy
 import numpy as np
 import numpy.typing as npt
 import pytest
+from policy_weights import random_weights
 
 from policy_pkg import native
 from policy_pkg.kernels import kernels
-from policy_pkg.policy import RecurrentPolicy, weight_shapes
+from policy_pkg.policy import RecurrentPolicy
 
 BUILDS = [name for name in native.FLAGS if native.FLAGS[name] <= native._flags()]
 SAME_ORDER = ("Haswell", "Zen")  # OpenBLAS' kernels that add up in the order of the compiled step
@@ -29,9 +30,7 @@ CASES = [
 
 
 def weights_of(obs: int, actions: int, robots: int, hidden: int, seed: int = 0) -> Weights:
-    rng = np.random.default_rng(seed)
-    shapes = weight_shapes(obs + actions + robots, hidden, actions)
-    return {k: 0.3 * rng.standard_normal(s, dtype=np.float32) for k, s in shapes.items()}
+    return random_weights(obs + actions + robots, hidden, actions, seed)
 
 
 def policy(

@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from policy_weights import random_weights
 
 from policy_pkg.act import Explorer, greedy
 from policy_pkg.episode import Episode, Sizes
@@ -15,22 +16,17 @@ from policy_pkg.learner.agent_net import AgentNet
 from policy_pkg.learner.config import LearnerConfig
 from policy_pkg.learner.learner import Learner
 from policy_pkg.learner.replay import Replay
-from policy_pkg.policy import RecurrentPolicy, weight_shapes
+from policy_pkg.policy import RecurrentPolicy
 
 SIZES = Sizes(n_robots=3, n_actions=6, obs_size=7, state_size=4, episode_limit=9)
 
 
-def random_weights(sizes: Sizes, hidden: int = 64, seed: int = 0) -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    shapes = weight_shapes(sizes.input_size, hidden, sizes.n_actions)
-    return {
-        name: (0.3 * rng.standard_normal(shape)).astype(np.float32)
-        for name, shape in shapes.items()
-    }
+def weights_of(sizes: Sizes, hidden: int = 64, seed: int = 0) -> dict[str, np.ndarray]:
+    return random_weights(sizes.input_size, hidden, sizes.n_actions, seed)
 
 
 def make_policy(sizes: Sizes = SIZES, hidden: int = 64) -> RecurrentPolicy:
-    return RecurrentPolicy(random_weights(sizes, hidden), sizes.n_robots, sizes.n_actions)
+    return RecurrentPolicy(weights_of(sizes, hidden), sizes.n_robots, sizes.n_actions)
 
 
 def random_episode(rng: np.random.Generator, steps: int) -> Episode:
@@ -79,7 +75,7 @@ def test_agrees_with_the_learners_agent_net_along_whole_episodes() -> None:
 def test_agrees_with_torchs_own_layers() -> None:
     """Linear, GRUCell, Linear on the concatenated one-hots, as PyMARL's RNNAgent computes it."""
     hidden_size, rows = 64, 300
-    weights = {name: torch.from_numpy(a) for name, a in random_weights(SIZES).items()}
+    weights = {name: torch.from_numpy(a) for name, a in weights_of(SIZES).items()}
     cell = torch.nn.GRUCell(hidden_size, hidden_size)
     names = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
     cell.load_state_dict({name: weights[f"rnn.{name}"] for name in names})
@@ -141,11 +137,11 @@ def test_results_are_not_overwritten_by_the_next_call() -> None:
 
 def test_set_weights_acts_like_a_new_policy_and_copies() -> None:
     policy = make_policy()
-    other = random_weights(SIZES, seed=9)
+    other = weights_of(SIZES, seed=9)
     policy.set_weights(other)
     obs = np.ones((3, SIZES.obs_size), dtype=np.float32)
     index = np.arange(3, dtype=np.int32)
-    fresh = RecurrentPolicy(random_weights(SIZES, seed=9), SIZES.n_robots, SIZES.n_actions)
+    fresh = RecurrentPolicy(weights_of(SIZES, seed=9), SIZES.n_robots, SIZES.n_actions)
     for array in other.values():
         array[...] = 0
     expected = fresh.forward(obs, index, index, fresh.initial_hidden(3))
@@ -165,14 +161,14 @@ def test_set_weights_acts_like_a_new_policy_and_copies() -> None:
     ],
 )
 def test_wrong_weights_are_refused_by_name(name: str, change, message: str) -> None:  # type: ignore[no-untyped-def]
-    weights = random_weights(SIZES)
+    weights = weights_of(SIZES)
     weights[name] = change(weights[name])
     with pytest.raises(ValueError, match=message):
         RecurrentPolicy(weights, SIZES.n_robots, SIZES.n_actions)
 
 
 def test_missing_and_unknown_weights_are_named() -> None:
-    weights = random_weights(SIZES)
+    weights = weights_of(SIZES)
     weights["fc3.bias"] = weights.pop("fc2.bias")
     with pytest.raises(ValueError, match=r"missing \['fc2\.bias'\], unknown \['fc3\.bias'\]"):
         RecurrentPolicy(weights, SIZES.n_robots, SIZES.n_actions)

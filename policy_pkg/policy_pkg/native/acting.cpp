@@ -16,23 +16,15 @@ constexpr int EIGHT = 8, BLAS_BLOCK = 320;
 template <int ROWS>
 void two_chains(const float* a, ptrdiff_t lda, const Packed& b, float* c, ptrdiff_t ldc) {
     const int pairs = b.depth / EIGHT * EIGHT;
+    const Vec zero[ROWS][2] = {};
     for (int j = 0; j < b.columns; j += WIDE) {
         const float* panel = b.data.data() + (j / WIDE) * b.panel;
-        Vec even[ROWS][2], odd[ROWS][2];
+        Vec even[ROWS][2], odd[ROWS][2], first[ROWS][2];
+        tile<ROWS>(pairs / 2, a, lda, 2, panel, 2 * b.ldb, zero, even);
+        tile<ROWS>(pairs / 2, a + 1, lda, 2, panel + b.ldb, 2 * b.ldb, zero, odd);
+        tile<ROWS>(b.depth - pairs, a + pairs, lda, 1, panel + pairs * b.ldb, b.ldb, even, first);
         for (int i = 0; i < ROWS; ++i)
-            for (int v = 0; v < 2; ++v) even[i][v] = odd[i][v] = all(0.0f);
-        const auto add_term = [&](int k, Vec(&sum)[ROWS][2]) {
-            const Vec b0 = load(panel + k * b.ldb), b1 = load(panel + k * b.ldb + LANES);
-            for (int i = 0; i < ROWS; ++i) {
-                const Vec x = all(a[i * lda + k]);
-                sum[i][0] = fma(x, b0, sum[i][0]);
-                sum[i][1] = fma(x, b1, sum[i][1]);
-            }
-        };
-        for (int k = 0; k < pairs; k += 2) add_term(k, even), add_term(k + 1, odd);
-        for (int k = pairs; k < b.depth; ++k) add_term(k, even);
-        for (int i = 0; i < ROWS; ++i)
-            for (int v = 0; v < 2; ++v) store(c + i * ldc + j + v * LANES, add(even[i][v], odd[i][v]));
+            for (int v = 0; v < 2; ++v) store(c + i * ldc + j + v * LANES, add(first[i][v], odd[i][v]));
     }
 }
 
@@ -108,6 +100,11 @@ void acting_set(void* net_, const float* const* parameters) {
 }
 
 void acting_free(void* net) { delete static_cast<Net*>(net); }
+
+// The padded widths of Step's hidden and q.
+void acting_widths(const void* net, int* h, int* a) {
+    *h = static_cast<const Net*>(net)->h, *a = static_cast<const Net*>(net)->a;
+}
 
 // Up to the tanh of r and z. Returns the first row whose last action or robot does not exist, or -1.
 int acting_gates(const void* net_, int rows, const Step* step) {

@@ -7,8 +7,6 @@ import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -17,26 +15,7 @@ from crash_coach_common.contract import FloatArray, IntArray
 from policy_pkg import native
 
 Weights = Mapping[str, npt.NDArray[np.float32]]
-_PAD = 32  # columns, as vectors.h
-_INT, _POINTER = ctypes.c_int, ctypes.c_void_p
-
-
-@cache
-def _loaded(name: str, folder: Path) -> ctypes.CDLL:
-    found = ctypes.CDLL(str(native.path(name, folder)))
-    found.acting_new.argtypes, found.acting_new.restype = [*[_INT] * 4, _POINTER], _POINTER
-    found.acting_set.argtypes, found.acting_set.restype = [_POINTER, _POINTER], None
-    found.acting_free.argtypes, found.acting_free.restype = [_POINTER], None
-    for part in (found.acting_gates, found.acting_candidate, found.acting_values):
-        part.argtypes, part.restype = [_POINTER, _INT, _POINTER], None
-    found.acting_gates.restype = _INT
-    return found
-
-
-def library() -> ctypes.CDLL | None:
-    """The kernels; None: numpy has to do it."""
-    name = native.build_name()
-    return None if name is None else _loaded(name, native.FOLDER)
+_POINTER = ctypes.c_void_p
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,12 +33,11 @@ class _Rows:
 
 
 class _Memory:
-    """For up to ``rows`` rows."""
+    """For up to ``rows`` rows. h, a: ``hidden`` and ``actions`` as the kernels pad them."""
 
-    def __init__(self, rows: int, obs: int, actions: int, hidden: int) -> None:
+    def __init__(self, rows: int, obs: int, actions: int, hidden: int, h: int, a: int) -> None:
         self.capacity = rows
         self._hidden, self._actions = hidden, actions
-        h, a = (-(-n // _PAD) * _PAD for n in (hidden, actions + _PAD))
         widths = (h, h, 3 * h, 3 * h, 2 * h, h, a)
         self._floats = [np.zeros((rows, width), dtype=np.float32) for width in (obs, *widths)]
         self._indices = [np.zeros(rows, dtype=np.int32) for _ in range(2)]
@@ -83,7 +61,10 @@ class CompiledStep:
     """As policy.RecurrentPolicy.forward, for a net that is one of ``compiled``."""
 
     def __init__(self, kernels: ctypes.CDLL, net: int, obs: int, actions: int, hidden: int) -> None:
-        self._net, self._set, self._sizes = net, kernels.acting_set, (obs, actions, hidden)
+        h, a = ctypes.c_int(), ctypes.c_int()
+        kernels.acting_widths(net, ctypes.byref(h), ctypes.byref(a))
+        self._net, self._set = net, kernels.acting_set
+        self._sizes = obs, actions, hidden, h.value, a.value
         weakref.finalize(self, kernels.acting_free, net)
         self._gates, self._candidate = kernels.acting_gates, kernels.acting_candidate
         self._values = kernels.acting_values
@@ -124,7 +105,7 @@ def compiled(weights: Weights, n_robots: int, n_actions: int) -> CompiledStep | 
 
     None: numpy has to do it, because there is no build or for sizes that it does not have.
     """
-    kernels = library()
+    kernels = native.library()
     if kernels is None:
         return None
     hidden, inputs = weights["fc1.weight"].shape

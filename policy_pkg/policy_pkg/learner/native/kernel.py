@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,37 +15,14 @@ from policy_pkg import native
 from policy_pkg.learner.memory import room
 
 Tape = npt.NDArray[np.float32]
-_INT, _POINTER = ctypes.c_int, ctypes.c_void_p
-_UNROLL: list[Any] = [_INT, _POINTER, _INT, _INT, _INT, _INT]
-_QMIX: list[Any] = [_INT] * 5
-# by function: how it begins, and how many pointers follow
-_ARGUMENTS = {
-    "unroll_forward": (_UNROLL, 4),
-    "unroll_backward": (_UNROLL, 5),
-    "qmix_forward": (_QMIX, 5),
-    "qmix_backward": (_QMIX, 7),
-}
-_TAPES = {"unroll_tape": 2, "qmix_tape": 5}  # by function: how many numbers it takes
-
-
-@cache
-def _loaded(name: str, folder: Path) -> ctypes.CDLL:
-    found = ctypes.CDLL(str(native.path(name, folder)))
-    for function, (sizes, pointers) in _ARGUMENTS.items():
-        getattr(found, function).argtypes = sizes + [_POINTER] * pointers
-        getattr(found, function).restype = None
-    for function, numbers in _TAPES.items():
-        getattr(found, function).argtypes = [_INT] * numbers
-        getattr(found, function).restype = ctypes.c_size_t
-    return found
+_POINTER = ctypes.c_void_p
 
 
 def library(*tensors: Tensor) -> ctypes.CDLL | None:
     """The kernels for ``tensors``; None: torch has to do it (GPU, float64, no build)."""
     if not all(x.dtype is torch.float32 and x.is_cpu for x in tensors):
         return None
-    name = native.build_name()
-    return None if name is None else _loaded(name, native.FOLDER)
+    return native.library()
 
 
 class Tapes:

@@ -276,10 +276,13 @@ def average(group: Group, key: str) -> Curve | None:
 
 def last_blocks(group: Group, key: str) -> list[float] | None:
     """Of each run the mean over its last LAST_BLOCKS blocks; None where one has fewer with it."""
-    measured = [run.values[key][~np.isnan(run.values[key])] for run in group.runs]
-    if min(map(len, measured)) < LAST_BLOCKS:
-        return None
-    return [float(np.mean(values[-LAST_BLOCKS:])) for values in measured]
+    rates = [_last_blocks(run, key) for run in group.runs]
+    return None if None in rates else [rate for rate in rates if rate is not None]
+
+
+def _last_blocks(run: Run, key: str) -> float | None:
+    measured = run.values[key][~np.isnan(run.values[key])]
+    return None if len(measured) < LAST_BLOCKS else float(np.mean(measured[-LAST_BLOCKS:]))
 
 
 def worst_victim(group: Group) -> list[float] | None:
@@ -288,8 +291,7 @@ def worst_victim(group: Group) -> list[float] | None:
     worst = []
     for run in group.runs:
         robots = [key for key in run.values if crashed_robot(key) and key != EACH_CRASHED]
-        each = (last_blocks(Group("", (run,)), key) for key in robots)
-        rates = [found[0] for found in each if found]
+        rates = [rate for key in robots if (rate := _last_blocks(run, key)) is not None]
         if not rates:
             return None
         worst.append(min(rates))
