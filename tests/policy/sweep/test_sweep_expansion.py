@@ -155,6 +155,7 @@ def test_the_papers_sweeps_can_be_read(name: str, size: str) -> None:
         ("combat", "3s5z_vs_3s5z", 10, 5),
         ("combat", "8m_vs_5z", 10, 5),
         ("combat", "8m_vs_5z_long", 5, 5),
+        ("combat", "3s5z_vs_3s5z_long", 4, 5),
     ],
 )
 def test_the_recipes_sweeps_give_every_method_the_same_learner(
