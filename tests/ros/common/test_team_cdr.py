@@ -81,6 +81,32 @@ def test_only_what_stands_up_to_the_last_of_ours_is_read() -> None:
             reader.split(joined[: len(joined) - behind - 8])
 
 
+def test_lengths_may_change_from_message_to_message() -> None:
+    """What is remembered of one message is not read into the next."""
+    reader = OBSERVATIONS.codec(("robot_3", "a"))
+    for changed in ("frame", "features", "actions", "none", "cut"):
+        messages = [observation(robot) for robot in (0, 1, 2)]
+        if changed == "frame":
+            messages[1].header.frame_id = "a longer one"
+        elif changed == "features":
+            messages[1].features = array("f", [0.25] * 7)
+        elif changed == "actions":
+            messages[0].available_actions = array("B", [1] * 9)
+        seen = TeamObservation(robots=list(ROBOTS[:3]), observations=messages)
+        data = bytes(serialize_message(seen))
+        if changed == "cut":
+            with pytest.raises(UserError, match="is cut short"):
+                reader.split(data[:-8])
+            continue
+        for _ in range(2):
+            assert {
+                robot: deserialize_message(it, Observation) for robot, it in reader.split(data)
+            } == {
+                0: messages[2],
+                1: messages[0],
+            }
+
+
 def test_other_bytes_are_refused() -> None:
     codec = COMMANDS.codec(ROBOTS)
     joined = codec.join(serialized([0, 1, 2], action))

@@ -35,19 +35,18 @@ def _behind_header(data: bytes, at: int) -> int:
     return behind
 
 
-def action_end(data: bytes, at: int) -> int:
-    """Where the Action that begins at ``at`` ends."""
-    return _behind_header(data, at) + COMMANDED.size
+def action_layout(data: bytes, at: int) -> tuple[tuple[int, ...], int]:
+    """Of the Action that begins at ``at`` where its lengths stand, and where it ends."""
+    return (at + _STAMP_SIZE,), _behind_header(data, at) + COMMANDED.size
 
 
-def observation_end(data: bytes, at: int) -> int:
-    """Where the Observation that begins at ``at`` ends."""
-    at = _behind_header(data, at) + OBSERVED.size
-    (n_features,) = COUNT.unpack_from(data, at)
-    at += COUNT.size + 4 * n_features
-    (n_actions,) = COUNT.unpack_from(data, at)
-    end: int = at + COUNT.size + n_actions
-    return end
+def observation_layout(data: bytes, at: int) -> tuple[tuple[int, ...], int]:
+    """Of the Observation that begins at ``at`` where its lengths stand, and where it ends."""
+    features_at = _behind_header(data, at) + OBSERVED.size
+    (n_features,) = COUNT.unpack_from(data, features_at)
+    available_at = features_at + COUNT.size + 4 * n_features
+    (n_actions,) = COUNT.unpack_from(data, available_at)
+    return (at + _STAMP_SIZE, features_at, available_at), available_at + COUNT.size + n_actions
 
 
 def common_step(data: bytes, at: int, count: int) -> tuple[int, int] | None:
@@ -79,20 +78,45 @@ class _Named(NamedTuple):
     upto_ours: int  # so many of the messages hold all of ours
 
 
+class _Places(NamedTuple):
+    """Where ours lie in a message, and in every other that has the same names and lengths: what
+    stands behind a length lies where that says."""
+
+    head: bytes  # encapsulation, names and their number
+    lengths: struct.Struct  # reads all of them up to the last of ours
+    values: tuple[int, ...]
+    ours: list[tuple[int, int, int]]  # robot, begin and end
+    end: int
+
+    def hold(self, data: bytes) -> bool:
+        """Whether this message is such a one."""
+        return (
+            len(data) >= self.end
+            and data.startswith(self.head)
+            and self.lengths.unpack_from(data) == self.values
+        )
+
+
 class TeamCodec:
     """Joins and splits the messages of ``robots``.
 
     Args:
         what: what the messages are called in errors.
-        end: where a robot's message ends, of those that begin at an offset.
+        layout: of a robot's message that begins at an offset where its lengths stand and its end.
     """
 
-    def __init__(self, what: str, robots: Sequence[str], end: Callable[[bytes, int], int]) -> None:
+    def __init__(
+        self,
+        what: str,
+        robots: Sequence[str],
+        layout: Callable[[bytes, int], tuple[tuple[int, ...], int]],
+    ) -> None:
         self._what = what
         self._robots = tuple(robots)
         self._all: list[int | None] = list(range(len(robots)))
         self._index = {name: index for index, name in enumerate(robots)}
-        self._end = end
+        self._layout = layout
+        self._places: _Places | None = None
         self._written: dict[tuple[int, ...], bytes] = {}  # what stands before some robots' messages
         self._read = _Named(b"", [], 0)
         # Robots that are processes of their own take turns.
@@ -119,23 +143,35 @@ class TeamCodec:
             UserError: not little-endian CDR, cut short up to the last of ours, or not one message
                 for each name.
         """
+        places = self._places
+        ours = places.ours if places is not None and places.hold(data) else self._find(data)
+        return [(robot, _ENCAPSULATION + data[begin:end]) for robot, begin, end in ours]
+
+    def _find(self, data: bytes) -> list[tuple[int, int, int]]:
+        """Robot, begin and end of each message that is ours."""
         if data[:2] != LITTLE_ENDIAN:
             raise UserError(
                 f"{self._what}: encapsulation {data[:2].hex()} is not little-endian CDR"
             )
-        found: list[RobotMessage] = []
+        ours: list[tuple[int, int, int]] = []
+        lengths_at: list[int] = []
         try:
-            named, end = self._named(data)
+            named, begin = self._named(data)
+            end = begin
             for robot in named.robots[: named.upto_ours]:
                 at = _aligned(end)
-                end = self._end(data, at)
+                found, end = self._layout(data, at)
+                lengths_at += found
                 if robot is not None:
-                    found.append((robot, _ENCAPSULATION + data[at:end]))
+                    ours.append((robot, at, end))
         except (struct.error, UnicodeDecodeError) as error:
             raise cut_short(self._what, data, error) from error
         if end > len(data):
             raise UserError(f"{self._what} of {len(data)} bytes is cut short")
-        return found
+        if len(named.robots) > 1:  # processes of one robot each take turns
+            lengths = _all_of(lengths_at)
+            self._places = _Places(data[:begin], lengths, lengths.unpack_from(data), ours, end)
+        return ours
 
     def begin_of_all(self, data: bytes) -> int | None:
         """Where the messages begin in one of all robots, in their order; None for any other."""
@@ -165,6 +201,13 @@ class TeamCodec:
         upto_ours = ours[-1] + 1 if ours else 0
         self._read = _Named(data[ENCAPSULATION_SIZE:end], robots, upto_ours)
         return self._read
+
+
+def _all_of(counts_at: Sequence[int]) -> struct.Struct:
+    """Reads the COUNTs that stand there, of which each lies behind the one before."""
+    behind = [0, *(at + COUNT.size for at in counts_at)]
+    gaps = [at - since for at, since in zip(counts_at, behind, strict=False)]
+    return struct.Struct("<" + "".join(f"{gap}xI" for gap in gaps))
 
 
 def _names(names: Iterable[str]) -> bytes:

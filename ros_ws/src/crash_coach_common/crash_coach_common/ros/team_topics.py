@@ -23,7 +23,12 @@ from crash_coach_common.contract import UserError
 from crash_coach_common.ros.peers import UNKNOWN, full_name
 from crash_coach_common.ros.qos import NEWEST
 from crash_coach_common.ros.qos_node import overridden
-from crash_coach_common.team_cdr import RobotMessage, TeamCodec, action_end, observation_end
+from crash_coach_common.team_cdr import (
+    RobotMessage,
+    TeamCodec,
+    action_layout,
+    observation_layout,
+)
 
 NAMESPACE = "_team"  # hidden: a bag of all topics then has the robots' own, as bags always had
 _LOOK_S = 1.0  # a node's name may come later than its subscriptions
@@ -36,14 +41,14 @@ class Kind:
     what: str
     robot_type: type
     team_type: type
-    end: Callable[[bytes, int], int]
+    layout: Callable[[bytes, int], tuple[tuple[int, ...], int]]
 
     def codec(self, robots: Sequence[str]) -> TeamCodec:
-        return TeamCodec(self.what, robots, self.end)
+        return TeamCodec(self.what, robots, self.layout)
 
 
-COMMANDS = Kind("team's commands", Action, TeamAction, action_end)
-OBSERVATIONS = Kind("team's observations", Observation, TeamObservation, observation_end)
+COMMANDS = Kind("team's commands", Action, TeamAction, action_layout)
+OBSERVATIONS = Kind("team's observations", Observation, TeamObservation, observation_layout)
 
 
 class RobotPublisher(Protocol):
