@@ -16,13 +16,17 @@ from policy_pkg.train.session import TEST_KEY
 
 RESULTS = Path(__file__).resolve().parents[3] / "results"
 CHECKPOINTS = sorted(path.parent for path in RESULTS.rglob("checkpoint.json"))
+WEIGHTLESS = RESULTS / "recipe/ablation"
+"""Of whose runs the page tells the blocks alone: but for seed 0 they keep the weights' SHA-256."""
 PLAYED = ("gridworld/adaptive-s0", "skirmish/2s3z-s0", "skirmish/3m-s0")
 
 
 def test_all_load() -> None:
     assert len(CHECKPOINTS) > 100
     for folder in CHECKPOINTS:
-        assert load_policy(folder).robots
+        run = folder.parent.parent
+        if run.parent != WEIGHTLESS or run.name.endswith("-s0"):
+            assert load_policy(folder).robots
 
 
 def lines(run: Path) -> list[dict[str, Any]]:
