@@ -9,7 +9,13 @@ from typing import Any
 
 import pytest
 
-from policy_pkg.checkpoint import list_checkpoints, load_policy
+from policy_pkg.checkpoint import (
+    AGENT,
+    CheckpointError,
+    list_checkpoints,
+    load_policy,
+    read_manifest,
+)
 from policy_pkg.play.conditions import crash_free
 from policy_pkg.play.evaluate import evaluate
 from policy_pkg.train.session import TEST_KEY
@@ -27,6 +33,10 @@ def test_all_load() -> None:
         run = folder.parent.parent
         if run.parent != WEIGHTLESS or run.name.endswith("-s0"):
             assert load_policy(folder).robots
+        else:
+            assert len(read_manifest(folder).files[AGENT].sha256) == 64
+            with pytest.raises(CheckpointError, match=r"agent\.safetensors is missing$"):
+                load_policy(folder)
 
 
 def lines(run: Path) -> list[dict[str, Any]]:

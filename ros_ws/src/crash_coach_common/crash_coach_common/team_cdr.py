@@ -23,6 +23,7 @@ from crash_coach_common.contract import UserError
 _STAMP_SIZE = 8
 _ENCAPSULATION = LITTLE_ENDIAN + bytes(2)
 RobotMessage = tuple[int, bytes]  # a robot's index, and its own serialized message
+Layout = Callable[[bytes, int], tuple[tuple[int, ...], int]]  # as ``action_layout``
 
 
 def _aligned(size: int) -> int:
@@ -105,12 +106,7 @@ class TeamCodec:
         layout: of a robot's message that begins at an offset where its lengths stand and its end.
     """
 
-    def __init__(
-        self,
-        what: str,
-        robots: Sequence[str],
-        layout: Callable[[bytes, int], tuple[tuple[int, ...], int]],
-    ) -> None:
+    def __init__(self, what: str, robots: Sequence[str], layout: Layout) -> None:
         self._what = what
         self._robots = tuple(robots)
         self._all: list[int | None] = list(range(len(robots)))

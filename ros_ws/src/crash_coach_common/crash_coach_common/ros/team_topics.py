@@ -24,6 +24,7 @@ from crash_coach_common.ros.peers import UNKNOWN, full_name
 from crash_coach_common.ros.qos import NEWEST
 from crash_coach_common.ros.qos_node import overridden
 from crash_coach_common.team_cdr import (
+    Layout,
     RobotMessage,
     TeamCodec,
     action_layout,
@@ -41,7 +42,7 @@ class Kind:
     what: str
     robot_type: type
     team_type: type
-    layout: Callable[[bytes, int], tuple[tuple[int, ...], int]]
+    layout: Layout
 
     def codec(self, robots: Sequence[str]) -> TeamCodec:
         return TeamCodec(self.what, robots, self.layout)
